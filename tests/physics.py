@@ -18,7 +18,7 @@ from lyra_petsc.mesh.points import Layout
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.newton.roundoff import residual_roundoff
+from lyra_petsc.stepping.newton.force_scales import residual_roundoff
 from lyra_petsc.stepping.problem import Problem, build_problem
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stepper import Attempt, Stepper
@@ -191,7 +191,7 @@ class Simulation:
             self.equations,
             self.problem.surface,
             whole.spacing,
-            residual_roundoff(self.equations, whole.largest_coordinate),
+            residual_roundoff(self.equations.forces, whole.largest_coordinate),
         )
         self.stepper.start(0.0, 0)
         self.time = 0.0
@@ -252,7 +252,7 @@ class Simulation:
 
     def step(self, dt: float) -> Attempt:
         """Compute one step, which must converge."""
-        self.equations.set_references(self.time)
+        self.equations.reference.record_starts(self.time, self.equations.x)
         end = self.time + dt
         attempt = self.stepper.attempt(self.time, end)
         assert attempt.converged, f"step to {end} s: {attempt}"

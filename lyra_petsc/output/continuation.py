@@ -37,10 +37,11 @@ def used_groups(scene: Scene) -> set[str]:
 
 def term_arrays(simulation: SteppedScene) -> TermArrays:
     """The arrays of the scene's terms in checkpoints; collective."""
-    equations, terms = simulation.problem.equations, simulation.problem.terms
-    widths = {name: rows.shape[1] for name, rows in term_states.element_arrays(equations).items()}
+    terms, layout = simulation.problem.terms, simulation.problem.points
+    stateful = simulation.problem.equations.active.stateful
+    widths = {name: rows.shape[1] for name, rows in term_states.element_arrays(stateful, layout).items()}
     elements = {name: (terms[name].stencil.shape[1], n) for name, n in widths.items()}
-    vertices, edges = term_states.vertex_arrays(equations), term_states.edge_arrays(equations)
+    vertices, edges = term_states.vertex_arrays(stateful), term_states.edge_arrays(stateful, layout)
     return TermArrays(vertices.keys(), edges.keys(), elements)
 
 

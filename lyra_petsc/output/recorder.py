@@ -187,16 +187,17 @@ class Recorder:
         simulation = self._simulation
         equations, layout = simulation.problem.equations, simulation.problem.points
         n, (saved, scalars) = layout.n_owned, simulation.saved_state()
+        stateful = equations.active.stateful
         rows = {"position": equations.x[:n], "velocity": equations.v[:n], **saved}
         for number, start in enumerate(sorted(equations.reference.late)):
             rows[f"start_{number}"] = equations.reference.late[start]
         arrays = {name: layout.split(values)[0] for name, values in rows.items()}
-        arrays |= term_states.vertex_arrays(equations)
+        arrays |= term_states.vertex_arrays(stateful)
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
-        edges |= term_states.edge_arrays(equations)
+        edges |= term_states.edge_arrays(stateful, layout)
         scalars["last_state"] = self._last_state
         began = clock.monotonic() if began is None else began
-        elements = term_states.element_arrays(equations)
+        elements = term_states.element_arrays(stateful, layout)
         self._wait_for_disk()  # the previous checkpoint is safe before this one takes its place
         self._checkpoints.write(arrays, scalars, edges, elements)
         if self._comm.rank == 0:

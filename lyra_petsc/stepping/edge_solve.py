@@ -29,7 +29,7 @@ def initial_moments(equations: StageEquations) -> float:
     """Norm [N] of the moments on free edges at the start of a run, handles set."""
     time, layout = equations.step.start, equations.points
     equations.change(prescribed=equations.prescriptions.of_step(time, time, equations.x))
-    force = equations.gradient_of(equations.active.sheet, equations.x)
+    force = equations.forces.sum(equations.active.sheet, equations.x, equations.step.frozen)
     moments = np.where(equations.step.prescribed.free, force, 0.0)[layout.n_vertices :]
     return float(np.sqrt(layout.global_sum(float(np.vdot(moments, moments)))[0]))
 

@@ -146,7 +146,13 @@ class EnergyBalance:
         self._reactions = self.damping = np.zeros(len(self._at))
         self._ends: tuple[Array, list[tuple[Array, Array]]] | None = None
         if not equations.integrator.dynamic:
-            self._ends = self._external_forces(equations.forces_now())[0], self._moving_targets()
+            still = np.zeros((equations.points.n_owned, 3))
+            self._ends = (
+                self._external_forces(equations.forces.parts(equations.at(equations.x, equations.v), still))[
+                    0
+                ],
+                self._moving_targets(),
+            )
         self.budget = Budget()
         self.measure()
 

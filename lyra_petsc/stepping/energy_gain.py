@@ -41,11 +41,9 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import EnergyBalance
+from lyra_petsc.stepping.newton.force_scales import ROUNDOFF
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Elastic, UpcomingStep
-
-ROUND_OFF = 10.0 * float(np.finfo(np.float64).eps)
-"""Relative round-off of a sum of energies."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,7 @@ class EndForces:
             stored=energy1,
             inertia=account.inertia,
             bracket=account.bracket + more,
-            noise=ROUND_OFF * (sizes + math.sqrt(2.0 * abs(energy1) * stiff) + ROUND_OFF * stiff),
+            noise=ROUNDOFF * (sizes + math.sqrt(2.0 * abs(energy1) * stiff) + ROUNDOFF * stiff),
         )
 
     def _kinetic(self, v: Array) -> tuple[float, float]:
@@ -275,9 +273,9 @@ class EndForces:
         displacement = moved.take(at)
         if not displacement.any():
             return 0.0
-        start, end = self._start.get("pull"), equations.gradient_of(self._plain, x1)
+        start, end = self._start.get("pull"), equations.forces.sum(self._plain, x1, equations.step.frozen)
         if start is None:
-            start = equations.gradient_of(self._plain, x0)
+            start = equations.forces.sum(self._plain, x0, equations.step.frozen)
         self._end["pull"] = end
         force = 0.5 * (start + end).take(at)
         targets, weight = np.zeros_like(x1), np.zeros_like(x1)

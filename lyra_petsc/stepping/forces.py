@@ -56,18 +56,24 @@ class StageForces:
         damping: Damping,
         edge_stiffness: Array,
     ) -> None:
-        self._discretisation, self._mass, self._active = discretisation, mass, active
+        self._discretisation, self.mass, self.active = discretisation, mass, active
         self._damping, self._edge_stiffness = damping, edge_stiffness
         self._squares: list[float] = []
         self._constrained: tuple[int, ConstrainedEntries] | None = None
 
     @property
-    def _layout(self) -> Layout:
+    def layout(self) -> Layout:
+        """Layout of the local rows."""
         return self._discretisation.layout
 
     def sum(self, terms: Sequence[Elastic | Viscous], at: Array, frozen: Frozen) -> Array:
         """Gradient (n_owned, 3) [N] of the sum of ``terms`` at positions or velocities (n_local, 3)."""
-        return gradient(terms, at, frozen, self._layout)
+        return gradient(terms, at, frozen, self.layout)
+
+    @property
+    def damps(self) -> bool:
+        """Whether any term is damped."""
+        return self._damping.active
 
     # -- F -----------------------------------------------------------------------------------------
 
@@ -77,15 +83,15 @@ class StageForces:
         They are generated one by one, because all of them together take much memory. Internal forces come
         last, because terms keep data of them, which take memory, too.
         """
-        step, active, self._squares = at.step, self._active, []
-        yield self._with_square(step, "inertia", self._mass[:, None] * rate)
+        step, active, self._squares = at.step, self.active, []
+        yield self._with_square(step, "inertia", self.mass[:, None] * rate)
         del rate
         springs = [term for term in active.external if term not in active.sliding]
         for name, terms in (("springs", springs), ("friction", active.sliding)):
             if terms:
                 yield self._with_square(step, name, self.sum(terms, at.x, step.frozen))
         yield self._with_square(step, "loads", -step.loads.force_at(at.x))
-        if self._damping.active:
+        if self.damps:
             yield self._with_square(step, "damping", at.damping)
         if active.viscous and not step.lagged:
             yield self._with_square(step, "wind", self.sum(active.viscous, at.v, step.frozen))
@@ -93,7 +99,7 @@ class StageForces:
 
     def internal(self, at: Evaluation) -> Array:
         """Forces (n_owned, 3) [N] of the sheet."""
-        return self.sum(self._active.sheet, at.x, at.step.frozen)
+        return self.sum(self.active.sheet, at.x, at.step.frozen)
 
     def damping(self, at: Evaluation) -> Array:
         """Forces (n_owned, 3) [N] of material damping."""
@@ -118,12 +124,17 @@ class StageForces:
         """
         step, held = at.step, at.step.prescribed
         self.total(at, step.stage.sigma * (v - step.v_h), out)
-        weight = step.stage.sigma * self._mass[held.indices // 3]
+        weight = step.stage.sigma * self.mass[held.indices // 3]
         held.overwrite(out, weight * (v.take(held.indices) - held.velocity))
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last computed, over the free unknowns; collective."""
-        return float(np.sqrt(self._layout.global_sum(*self._squares).max(initial=0.0)))
+        return float(np.sqrt(self.layout.global_sum(*self._squares).max(initial=0.0)))
+
+    def out_of_balance(self, at: Evaluation) -> Array:
+        """Force (n_owned, 3) [N] on the free unknowns without inertia."""
+        total = self.total(at, np.zeros((len(self.mass), 3)), np.empty((len(self.mass), 3)))
+        return np.where(at.step.prescribed.free, -total, 0.0)
 
     # -- objective ---------------------------------------------------------------------------------
 
@@ -133,10 +144,10 @@ class StageForces:
         The scale is the sum of the absolute summands and of the geometric mean of each elastic energy and the
         energy at which strains are of order one: small strains are small differences of large coordinates.
         """
-        step, n = at.step, len(self._mass)
+        step, n = at.step, len(self.mass)
         rate, v, frozen = 1.0 / step.stage.c, at.v[:n], step.frozen
-        parts, square = [step.stage.sigma * kinetic_energy(self._mass, v - step.v_h)], 0.0
-        for term in self._active.elastic:
+        parts, square = [step.stage.sigma * kinetic_energy(self.mass, v - step.v_h)], 0.0
+        for term in self.active.elastic:
             if not term.n_elements:
                 continue
             each = term.energies(at.x, frozen[term])
@@ -155,17 +166,17 @@ class StageForces:
         parts.append(-rate * float(np.vdot(step.loads.force, at.x[:n] - step.x[:n])))
         if step.loads.following is not None:
             parts.append(rate * step.loads.following.energy(at.x))
-        if self._damping.active:
+        if self.damps:
             parts.append(0.5 * float(np.vdot(v, at.damping)))
         if not step.lagged:
-            parts += [float(wind.potentials(at.v, frozen[wind]).sum()) for wind in self._active.viscous]
-        value, size, square = self._layout.global_sum(sum(parts), sum(map(abs, parts)), square)
+            parts += [float(wind.potentials(at.v, frozen[wind]).sum()) for wind in self.active.viscous]
+        value, size, square = self.layout.global_sum(sum(parts), sum(map(abs, parts)), square)
         return float(value), float(size) + float(np.sqrt(square))
 
     @cached_property
     def stiffnesses(self) -> dict[Term, Array]:
         """Force over displacement [N/m] of the owned elements of each term for which it is constant."""
-        elastic = self._active.elastic
+        elastic = self.active.elastic
         constant = [t for t in elastic if not (t.registration.of_contact or isinstance(t, LimitsStep))]
         return {term: term.force_scale(1.0)[: term.n_owned] for term in constant}
 
@@ -182,7 +193,7 @@ class StageForces:
         unknowns in steps of one linear solve, or None.
         """
         step, rows, reach = at.step, self._discretisation.rows, at.step.stage.c
-        inertia = step.stage.sigma * self._mass
+        inertia = step.stage.sigma * self.mass
         if len(self._edge_stiffness):
             inertia[len(inertia) - len(self._edge_stiffness) :] += reach * self._edge_stiffness
         constrained = self.constrained(step.prescribed)
@@ -190,10 +201,10 @@ class StageForces:
         whole = step.linear and blend == 1.0
         if not (whole and self._damping.assemble_with_stiffness(reach, inertia, values, changing)):
             self._damping.assemble(values, inertia)
-            for term in self._active.elastic:
+            for term in self.active.elastic:
                 rows.add_stiffness(term, at.x, step.frozen[term], blend, reach, values, predicted)
         if not step.lagged:
-            for wind in self._active.viscous:
+            for wind in self.active.viscous:
                 wind.add_hessian(at.v, step.frozen[wind], rows.pattern.offsets, values)
         if step.loads.following is not None and blend < 1.0:
             step.loads.following.add_hessian((1.0 - blend) * reach, rows.pattern, values)
@@ -217,9 +228,9 @@ class StageForces:
         """The product (n_owned, 3) [N] of the Jacobian ``values``, before prescribed unknowns are decoupled,
         with the velocities of these; 0 in their rows. None if none moves; collective.
         """
-        increment = np.zeros((len(self._mass), 3))
+        increment = np.zeros((len(self.mass), 3))
         prescribed.overwrite(increment, prescribed.velocity)
-        if not any(self._layout.global_max(bool(increment.any()))):
+        if not any(self.layout.global_max(bool(increment.any()))):
             return None
-        product = self._discretisation.rows.product(values, self._layout.extended(increment))
+        product = self._discretisation.rows.product(values, self.layout.extended(increment))
         return np.where(prescribed.free, product, 0.0)

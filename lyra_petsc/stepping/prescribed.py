@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +13,11 @@ from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
+from lyra_petsc.terms.protocols import FollowsHandles
+from lyra_petsc.terms.term import Term
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.time_step import TimeStep
 
 _numbers = itertools.count()
 
@@ -56,13 +63,34 @@ class PrescribedUnknowns:
 
 
 class Prescriptions:
-    """What exact handles prescribe in the steps of one rank."""
+    """What exact handles prescribe in the steps of one rank.
+
+    Parameters
+    ----------
+    discretisation : Discretisation
+    held : ExactHandles
+    terms : iterable of Term
+    starts : iterable of float
+        Times [s] at which handles and springs start.
+
+    Attributes
+    ----------
+    reference : ReferencePositions
+    none : PrescribedUnknowns
+        Those of the padding row.
+    """
 
     def __init__(
-        self, discretisation: Discretisation, held: ExactHandles, reference: ReferencePositions
+        self,
+        discretisation: Discretisation,
+        held: ExactHandles,
+        terms: Iterable[Term],
+        starts: Iterable[float],
     ) -> None:
-        self._discretisation, self._held, self._reference = discretisation, held, reference
-        layout = discretisation.layout
+        self._discretisation, self._held, layout = discretisation, held, discretisation.layout
+        following = [term.reference_rows for term in terms if isinstance(term, FollowsHandles)]
+        rows = np.concatenate([held.reference_rows, *following])
+        self.reference = ReferencePositions(layout, rows, starts)
         self.none = self._unknowns(np.zeros((layout.n_owned, 3), dtype=np.bool_))
         self._active: tuple[tuple[int, ...], PrescribedUnknowns] | None = None
 
@@ -116,11 +144,15 @@ class Prescriptions:
     def positions(self, t0: float, t1: float, at: float, x: Array) -> Array:
         """Positions (n_owned, 3) that handles prescribe at time ``at`` [s], elsewhere x (n_local, 3)."""
         out = x[: self._discretisation.layout.n_owned].copy()
-        self._held.targets(t0, t1, at, self._reference.at, out)
+        self._held.targets(t0, t1, at, self.reference.at, out)
         return out
+
+    def end_rates(self, step: TimeStep) -> Array:
+        """Velocities (m,) [m/s] of the prescribed unknowns at the end of a step."""
+        return self.rates(step.prescribed, step.start, step.end, step.end)
 
     def rates(self, unknowns: PrescribedUnknowns, t0: float, t1: float, at: float) -> Array:
         """Velocities (m,) [m/s] of the prescribed unknowns at time ``at`` [s] of the step t0..t1 [s]."""
         out = np.zeros((self._discretisation.layout.n_owned, 3))
-        self._held.velocities(t0, t1, at, self._reference.at, out)
+        self._held.velocities(t0, t1, at, self.reference.at, out)
         return out.take(unknowns.indices)

@@ -157,8 +157,7 @@ def build_problem(
     def prepare() -> WholeProblem:
         nonlocal global_mesh, mesh
         mesh = known or build_scene_mesh(scene, phases.report)
-        whole, global_mesh = _prepare(scene, mesh)
-        global_mesh.owner = owner
+        whole, global_mesh = _prepare(scene, mesh, owner)
         return whole
 
     with phases("mesh"):
@@ -193,7 +192,7 @@ def event_times(scene: Scene) -> list[float]:
     return [*(t for window in windows for t in window.events()), *jumps]
 
 
-def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
+def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem, GlobalMesh]:
     """Compute everything that is to be distributed (on rank 0)."""
     rest = RestShape(scene, mesh)
     massless = np.flatnonzero(~(rest.mass > 0.0))
@@ -269,7 +268,14 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
     on_edges = any(each.edges is not None for each in elements.values())
     edges = rest.edges if on_edges else None
     return whole, GlobalMesh(
-        mesh.n_vertices, mesh.triangles, elements, data, edges, positions=positions, vertex_sets=sets
+        mesh.n_vertices,
+        mesh.triangles,
+        elements,
+        data,
+        edges,
+        owner=owner,
+        positions=positions,
+        vertex_sets=sets,
     )
 
 
@@ -445,9 +451,9 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
             elements = part.elements[name].without("length", "rest_height")
             data = {**elements.data, "rest_angle": elements.data["k"]}
             elements = replace(elements, data=data, index=np.empty(0, dtype=np.int32))
-            coarse = cast("Elastic", make_term(entry, elements, scene, on_vertices))
-            coarse.registration = replace(entry, name=name)  # another sheet may have this term
-            equations.active.coarse[term] = coarse
+            # of its own name, as another sheet may have this term
+            coarse = make_term(entry, elements, scene, on_vertices, name)
+            equations.active.coarse[term] = cast("Elastic", coarse)
     data, rows = part.vertex_data, slice(0, layout.n_vertices)
     equations.x[rows] = data["position"]
     layout.update_ghosts(equations.x)
@@ -455,11 +461,11 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
         equations.x[rows].copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil
     )
     # reference positions of handles are those before noise
-    equations.set_references(0.0)
+    equations.reference.record_starts(0.0, equations.x)
     equations.x[rows] = data.get("start", data["position"])
     equations.v[rows] = data.get("velocity", 0.0)
     equations.state.update_ghosts()
-    equations.evaluate_at_start()
+    equations.evaluate(equations.stationary_velocity())
     for term in equations.active.stateful:
         term.initialise(equations.x)
     equations.hold_targets(0.0)

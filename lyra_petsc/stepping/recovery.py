@@ -111,7 +111,7 @@ def _give_up(run: SteppedScene, step: RejectedStep) -> NoReturn:
             collective=True,
         )
     assert step.attempt.failed_solve is not None
-    run.failure = explain_failure(
+    failure = explain_failure(
         run.problem,
         run.scene,
         run.stepper.solver,
@@ -121,7 +121,7 @@ def _give_up(run: SteppedScene, step: RejectedStep) -> NoReturn:
         time=run.time,
         iterations_key=_iterations_key(),
     )
-    raise SolverError(run.failure.sentence, collective=True, details=run.failure.lines)
+    run.fail(failure)
 
 
 def _at(run: SteppedScene) -> str:

@@ -37,7 +37,7 @@ def saved_state(run: SteppedScene) -> tuple[dict[str, Array], dict[str, Any]]:
         **stepper,
         "energy": None if run.guard is None else run.guard.saved_state(),
         "late_starts": sorted(equations.reference.late),
-        "obstacles": term_states.obstacle_places(equations),
+        "obstacles": {} if equations.contact is None else equations.contact.barrier.obstacles.places,
     }
     if run.equilibrium is not None:
         more, scalars["equilibrium"] = run.equilibrium.saved_state(time)
@@ -61,10 +61,11 @@ def resume(
     """
     equations = run.problem.equations
     equations.state.update_ghosts()
-    term_states.restore_fixed(equations, arrays, edges, elements)
-    run.time, run.step_number = scalars["time"], scalars["step"]
+    term_states.restore_fixed(
+        equations.active.stateful, equations.points, equations.x, arrays, edges, elements
+    )
     # loads and handles that only the changed scene starts earlier start now; the others have started
-    equations.set_references(run.time)
+    equations.reference.record_starts(run.time, equations.x)
     equations.hold_targets(run.time)
     refuse_overrun(equations, run.scene, f"at {run.time_text()}")
     refuse_contact(equations, run.scene, f"at {run.time_text()}")
@@ -76,10 +77,11 @@ def resume(
     if run.guard is not None:
         run.guard.restore(scalars["energy"], same=scalars["scheme"] == run.scene.time.scheme)
     if run.accuracy is not None:
-        run.accuracy.estimated = scalars["estimated_error"]
-        run.accuracy.local_error.restore(arrays, scalars["integrator"])
-    term_states.restore_changing(equations, elements, scalars["obstacles"])
+        run.accuracy.restore(arrays, scalars)
+    friction = None if equations.contact is None else equations.contact.friction
+    if friction is not None and friction.name in elements:
+        pairs = elements[friction.name]
+        term_states.restore_changing(friction, equations.points, pairs, scalars["obstacles"])
+        friction.initialise_pairs(equations.x, equations.step.frozen[friction])
     run.stepper.restore(arrays, scalars, run.time, run.step_number)
-    run.totals |= scalars["totals"]
-    run.stability = run.stability and scalars["stability"]
     run.run_notes.restore(scalars)

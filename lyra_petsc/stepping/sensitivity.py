@@ -310,7 +310,7 @@ class Sensitivities:
                     each.equations.follow_step(before.v + each.offset * delta * tangent.v)
             self._update_tangent(tangent, neighbours, delta)
             for each in neighbours:
-                each.equations.set_references(end)
+                each.equations.reference.record_starts(end, each.equations.x)
 
     def _begin_step(
         self, each: Neighbour, before: _StepStart, tangent: Tangent, delta: float, end: float, *, semi: bool
@@ -463,12 +463,12 @@ class Sensitivities:
                 self._force_derivative(now, neighbours, delta, tangent.x)
                 for each in neighbours:
                     if each.energy_balance is not None:
-                        each.equations.evaluate_at_start()
+                        each.equations.evaluate(each.equations.stationary_velocity())
                         each.energy_balance.record(now.x)
-                    each.equations.set_references(now.factor)
+                    each.equations.reference.record_starts(now.factor, each.equations.x)
         integrator.pseudo_dt = pseudo
         equations.begin_step(now.before, now.factor)
-        equations.evaluate_at_start()
+        equations.evaluate(equations.stationary_velocity())
 
     def _force_derivative(self, now: _Equilibrium, neighbours: Neighbours, delta: float, dx: Array) -> Array:
         """Derivative (n_owned, 3) [N] of the out-of-balance force if that of the positions is ``dx``."""

@@ -7,13 +7,13 @@ import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NoReturn
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError
+from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.linear.petsc_options import fill_gaps, unknown
 from lyra_petsc.linear.refused_options import check_options, check_size
@@ -21,13 +21,13 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping import contact_steps
+from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.accuracy import Accuracy
 from lyra_petsc.stepping.compression_watch import CompressionWatch
 from lyra_petsc.stepping.energy_balance import Budget, EnergyBalance
 from lyra_petsc.stepping.energy_guard import EnergyGuard
 from lyra_petsc.stepping.failure.failure_report import FailedAttempt, Failure
-from lyra_petsc.stepping.newton.roundoff import residual_roundoff
+from lyra_petsc.stepping.newton.force_scales import residual_roundoff
 from lyra_petsc.stepping.problem import Problem, build_problem, event_times
 from lyra_petsc.stepping.recovery import RejectedStep, Trouble, recover
 from lyra_petsc.stepping.resumption import resume, saved_state
@@ -131,7 +131,7 @@ class SteppedScene:
         whole, equations = self.problem.whole, self.problem.equations
         check_size(self.problem.points.n_unknowns)
         with self.phases("solve"):
-            floor = residual_roundoff(equations, whole.largest_coordinate)
+            floor = residual_roundoff(equations.forces, whole.largest_coordinate)
             if not math.isfinite(floor):
                 raise InputError(
                     "stiffness times size overflows; give smaller numbers or another unit of length",
@@ -146,6 +146,7 @@ class SteppedScene:
         self.accuracy: Accuracy | None = None
         if isinstance(self.control, ToleranceControl):
             self.accuracy = Accuracy(equations, self.control, scene.time.tolerance or 0.0, whole.size)
+            equations.start_acceleration.followers.append(self.accuracy.local_error)
         self.time, self.step_number = 0.0, 0
         self.compression = CompressionWatch(self.problem)
         self.stability: dict[str, Any] = {}
@@ -159,7 +160,8 @@ class SteppedScene:
         for term in equations.active.stateful:
             if isinstance(term, Dissipates):  # whose rest state has edges in equilibrium
                 term.initialise(equations.x)
-        self.notes.extend(nothing_acts(scene, equations, event_times(scene), self.control.end, floor))
+        start = equations.at(equations.x, equations.v)
+        self.notes.extend(nothing_acts(scene, start, event_times(scene), self.control.end, floor))
         self.equilibrium: Equilibrium | None = None
         if scene.time.static:
             sizes = whole.spacing, whole.size, floor, self.control.end
@@ -258,7 +260,7 @@ class SteppedScene:
         note_step(self, attempt)
         for term in equations.active.stateful:
             term.accept(equations.x, equations.step.frozen[term])
-        equations.set_references(self.time)
+        equations.reference.record_starts(self.time, equations.x)
         self.stepper.monitor()
         seconds = clock.perf_counter() - COMPILATION.seconds - started
         took = newton, linear, rejected, attempt.residual, seconds
@@ -272,7 +274,7 @@ class SteppedScene:
         if not attempt.converged:
             return Trouble.CROSSING if attempt.message.startswith(WOULD_CROSS) else Trouble.UNSOLVED
         equations, n = self.problem.equations, self.problem.points.n_owned
-        if not contact_steps.is_resolved(equations):
+        if not limits.is_resolved(equations):
             return Trouble.UNRESOLVED
         if self.accuracy is not None and not self.accuracy.accepts(v_before[:n], dt):
             return Trouble.INACCURATE
@@ -301,6 +303,16 @@ class SteppedScene:
             self.accuracy.local_error.restore(*error)
         self.stepper.start(self.time, self.step_number)
 
+    def fail(self, failure: Failure) -> NoReturn:
+        """End the run before a step that has no solution.
+
+        Raises
+        ------
+        SolverError
+        """
+        self.failure = failure
+        raise SolverError(failure.sentence, collective=True, details=failure.lines)
+
     @property
     def in_vain(self) -> bool:
         """Whether a smaller increment of an equilibrium would not help."""
@@ -323,6 +335,9 @@ class SteppedScene:
         elements: Mapping[str, tuple[Ints, Array]] = MappingProxyType({}),
     ) -> None:
         """Continue from a `saved_state`; see `resumption`."""
+        self.time, self.step_number = scalars["time"], scalars["step"]
+        self.totals |= scalars["totals"]
+        self.stability = self.stability and scalars["stability"]
         resume(self, arrays, scalars, edges, elements)
 
     def destroy(self) -> None:

@@ -23,16 +23,14 @@ from lyra_petsc.stepping.integrators.in_use import IntegratorsInUse
 from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
 from lyra_petsc.stepping.predicted_stress import PredictedStress
 from lyra_petsc.stepping.prescribed import Prescriptions
-from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.start_acceleration import StartAcceleration
 from lyra_petsc.stepping.state import State
 from lyra_petsc.stepping.time_step import Evaluation, TimeStep
 from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
-from lyra_petsc.terms.protocols import FollowsHandles
-from lyra_petsc.terms.term import Elastic, Term, UpcomingStep
+from lyra_petsc.terms.term import Term, UpcomingStep
 
 if TYPE_CHECKING:
-    from lyra_petsc.contact.impacts import ContactImpulses, StepEnd
+    from lyra_petsc.contact.impacts import ContactImpulses
     from lyra_petsc.contact.scene_contact import SceneContact
 
 
@@ -60,14 +58,9 @@ class StageEquations:
         The present one, or the last.
     evaluated : Evaluation
         The last one; after a step that of its stage.
-    forces : StageForces
-    reference : ReferencePositions
-    prescriptions : Prescriptions
-    start_acceleration : StartAcceleration
-    active : ActiveTerms
-    damping : Damping
     load_case : LoadCase
-    directors : Directors
+        That of the next step.
+    forces, active, damping, directors, prescriptions, reference, start_acceleration : parts
     predicted_stress : PredictedStress
         That of the Jacobian.
     integrators : IntegratorsInUse
@@ -78,8 +71,6 @@ class StageEquations:
     """
 
     has_active_pairs = nears_limit = False
-    past_velocity: Array | None = None
-    """(n_owned, 3) before the last step, if there is contact."""
 
     def __init__(
         self,
@@ -101,10 +92,8 @@ class StageEquations:
         self.integrators = IntegratorsInUse(integrator, limited=limited)
         discretisation.when_ghosts_change(self._follow_ghosts)
         self.held = held
-        following = [term.reference_rows for term in terms if isinstance(term, FollowsHandles)]
-        rows = np.concatenate([held.reference_rows, *following])
-        self.reference = ReferencePositions(self.points, rows, starts)
-        self.prescriptions = Prescriptions(discretisation, held, self.reference)
+        self.prescriptions = Prescriptions(discretisation, held, terms, starts)
+        self.reference = self.prescriptions.reference
         self.load_case = LoadCase()
         once = integrator.lagged_loads
         self.damping = Damping(
@@ -114,13 +103,13 @@ class StageEquations:
         edges = self.directors.min_stiffness
         self.forces = StageForces(discretisation, mass, active, self.damping, edges)
         self.state = State(discretisation)
-        nothing = StepLoads(np.zeros((len(mass), 3)))
-        none, frozen = self.prescriptions.none, dict.fromkeys(terms)
-        rest = Stage(1.0, 1.0, 1.0)
-        zero = self.v[: len(mass)]
-        self.step = TimeStep(0.0, 0.0, rest, self.x, self.x, zero, none, nothing, frozen, lagged=once)
+        zero, none, frozen = self.v[: len(mass)], self.prescriptions.none, dict.fromkeys(terms)
+        stage, loads = Stage(1.0, 1.0, 1.0), StepLoads(np.zeros((len(mass), 3)))
+        self.step = TimeStep(0.0, 0.0, stage, self.x, self.x, zero, none, loads, frozen, lagged=once)
         self.evaluated = self.at(self.x, self.v)
-        self.start_acceleration = StartAcceleration(events)
+        self.start_acceleration = StartAcceleration(
+            events, self.integrators, self.forces, self.state, self.prescriptions, contact
+        )
         self.predicted_stress = PredictedStress()
 
     @property
@@ -143,18 +132,13 @@ class StageEquations:
         """Velocities (n_local, 3) [m/s] of the state."""
         return self.state.v
 
-    def set_references(self, time: float) -> None:
-        """Take the present positions as reference of handles that start to act by ``time`` [s]."""
-        self.reference.record_starts(time, self.x)
-
     def take_loads(self, **changes: Any) -> None:
         """Change entries of the load case of the next step."""
         self.load_case = replace(self.load_case, **changes)
 
     def targets_at(self, time: float, x: Array | None = None) -> UpcomingStep:
         """The step as terms receive it to freeze their data at a time [s] of it."""
-        step, x = self.step, self.x if x is None else x
-        return UpcomingStep(step.start, step.end, time, x, self.reference.at)
+        return self.step.upcoming(time, self.x if x is None else x, self.reference)
 
     def change(self, **changes: Any) -> None:
         """Go on with another step, with these entries changed: what has been evaluated holds no longer."""
@@ -179,8 +163,8 @@ class StageEquations:
         """Put moving targets at their positions at ``time`` [s], between two steps; collective."""
         self.change(start=time, end=time)
         self.change(frozen=self.active.freeze(self.targets_at(time)))
-        self.update_stencils(self.x)  # energies at the start of a run need all stencils
         if self.contact is not None:
+            self.contact.update(self.x)  # energies at the start of a run need all stencils
             self.contact.initialise(self.x, self.step.frozen)
         self.nears_limit = self.active.limits_act(self.x, self.step.frozen, self.points)
 
@@ -197,21 +181,16 @@ class StageEquations:
         self._freeze(at)
         if self.contact is not None and self.contact.obstacles_move:  # they may have come near
             self.contact.update(self.x, self.expected_displacement(), self.expected_displacement)
-        self.start_acceleration.begin_step(self, at)
+        self.start_acceleration.begin_step(self.step, self.frozen_positions(at))
         self._set_stage(at)
 
     def expected_displacement(self, steps: int = 1) -> Array:
-        """Displacements (n_local, 3) [m] of the step at constant velocities, of handles exactly.
+        """As `State.expected_displacement` in the present step; collective."""
+        return self.state.expected_displacement(self.step.dt, self.step.prescribed, steps)
 
-        Those of several ``steps`` are with the accelerations of the last step.
-        """
-        held, n = self.step.prescribed, len(self.mass)
-        displacement = steps * self.step.dt * self.v
-        if steps > 1 and self.past_velocity is not None:
-            displacement[:n] += 0.5 * steps**2 * self.step.dt * (self.v[:n] - self.past_velocity)
-        held.overwrite(displacement[:n], float(steps) * (held.goal - self.x[:n].take(held.indices)))
-        self.points.update_ghosts(displacement)
-        return displacement
+    def frozen_positions(self, at: float) -> Array:
+        """Positions (n_local, 3) [m] whose geometry is frozen during a step with the stage at ``at`` [s]."""
+        return self.state.moved(at - self.step.start) if self.integrator.centred else self.x
 
     def _freeze(self, at: float) -> None:
         """Freeze geometry, targets and loads at the time ``at`` [s] of the stage."""
@@ -232,16 +211,6 @@ class StageEquations:
         )
         if self.damping.active:
             self.damping.freeze(x, frozen)
-
-    def frozen_positions(self, at: float) -> Array:
-        """Positions (n_local, 3) [m] whose geometry is frozen during the step."""
-        if not self.integrator.centred:
-            return self.x
-        x = self.x + (at - self.step.start) * self.v
-        if self.points.n_edges_global:  # unknowns of edges are never extrapolated
-            edges = ~self.points.are_vertices(self.points.global_number)
-            x[edges] = self.x[edges]
-        return x
 
     def _set_stage(self, at: float) -> None:
         """Set the stage at the time ``at`` [s], its histories, and the velocities of prescribed unknowns."""
@@ -280,7 +249,7 @@ class StageEquations:
         self.integrators.record_step(before, rate_before, held.free, step.dt)
         held.overwrite(moved, held.goal)
         if self.integrator.handles_at_stage:
-            self._set_end_rates(rate)
+            held.overwrite(rate, self.prescriptions.end_rates(step))
         self.state.set(moved, rate)
         if step.linear and not self.active.moving:
             # the stage is at the end, and the next step is linearised there
@@ -290,24 +259,19 @@ class StageEquations:
         if not self.integrator.dynamic or self.contact is None:
             return
         if not step.ends_at_stage:  # pairs that come near between the stage and the end
-            self.update_stencils(self.evaluated.x, self.x - self.evaluated.x)
-        self.past_velocity = rate_before
-        end = self.step_end(self.v)
+            self.contact.update(self.evaluated.x, self.x - self.evaluated.x)
+        self.state.keep_past(rate_before)
+        end = step.contact_end(self.points, self.mass, self.x, self.v, self.integrator.order)
         impulses = self.contact.finish(end, step.frozen, damps=self.integrators.suits_contact)
         if impulses is not None:
             self.state.set(self.x[:n], self.v[:n] + impulses.change)
             self.integrators.in_contact.shift_past_velocities(impulses.change)
 
-    def _set_end_rates(self, velocity: Array) -> None:
-        """Overwrite prescribed unknowns of ``velocity`` (n_owned, 3) by those of handles at the end."""
-        step = self.step
-        if self.held and step.end > step.start:
-            rates = self.prescriptions.rates(step.prescribed, step.start, step.end, step.end)
-            step.prescribed.overwrite(velocity, rates)
-
     def output_velocity(self) -> Array:
         """Velocities (n_owned, 3) [m/s] for output: those of prescribed unknowns are ẋ*(t)."""
-        self._set_end_rates(velocity := self.v[: len(self.mass)].copy())
+        velocity = self.v[: len(self.mass)].copy()
+        if self.step.dt > 0.0:
+            self.step.prescribed.overwrite(velocity, self.prescriptions.end_rates(self.step))
         return velocity
 
     # -- evaluations -------------------------------------------------------------------------------
@@ -336,27 +300,18 @@ class StageEquations:
     def revisit(self, evaluation: Evaluation) -> Evaluation:
         """An evaluation of the present step again, with the pairs that are near there; collective."""
         self.evaluated = evaluation
-        self.update_stencils(evaluation.x)
+        if self.contact is not None:
+            self.contact.update(evaluation.x)
         return self.evaluated
-
-    def evaluate_at_start(self) -> None:
-        """Evaluate the stage at the positions where the step starts; collective."""
-        self.evaluate(self.stationary_velocity())
 
     def residual_at(self, v: Array) -> Array:
         """F (n_owned, 3) [N] at velocities v (n_owned, 3); collective."""
         self.forces.residual(v, self.linearised(v), out := np.empty_like(v))
         return out
 
-    def out_of_balance(self, v: Array | None = None) -> Array:
-        """Force (n_owned, 3) [N] on the free unknowns, with the state's velocities or v (n_local, 3)."""
-        at = self.at(self.x, self.v if v is None else v)
-        total = self.forces.total(at, np.zeros((len(self.mass), 3)), np.empty((len(self.mass), 3)))
-        return np.where(self.step.prescribed.free, -total, 0.0)
-
-    def forces_now(self) -> Iterator[tuple[str, Array]]:
-        """The parts of F at the start of the step without inertia, each (n_owned, 3) [N]."""
-        return self.forces.parts(self.at(self.x, self.v), np.zeros((len(self.mass), 3)))
+    def out_of_balance(self) -> Array:
+        """Force (n_owned, 3) [N] on the free unknowns in the state, without inertia."""
+        return self.forces.out_of_balance(self.at(self.x, self.v))
 
     def forces_at_stage(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
@@ -371,10 +326,6 @@ class StageEquations:
         """Velocities (n_owned, 3) [m/s] of the stage of the step just accepted."""
         return self.evaluated.v[: len(self.mass)]
 
-    def gradient_of(self, terms: Sequence[Elastic], x: Array) -> Array:
-        """Gradient (n_owned, 3) [N] at x (n_local, 3) of the energy of ``terms``."""
-        return self.forces.sum(terms, x, self.step.frozen)
-
     def displacement(self, v: Array, increment: Array) -> tuple[Array, Array]:
         """Stage positions at velocities v (n_owned, 3), and displacements from there, both (n_local, 3) [m].
 
@@ -383,14 +334,6 @@ class StageEquations:
         return self.evaluate(v).x, self.points.extended(increment * self.step.stage.c)
 
     # -- contact -------------------------------------------------------------------------------------
-
-    def step_end(self, v: Array) -> StepEnd:
-        """The step's end with velocities v (n_local, 3), for contact."""
-        from lyra_petsc.contact.impacts import StepEnd
-
-        step, held, order = self.step, self.step.prescribed, self.integrator.order
-        times = step.start, step.end
-        return StepEnd(self.points, self.mass, held.free, held.indices, self.x, v, *times, order)
 
     @property
     def contact_impulses(self) -> ContactImpulses | None:
@@ -406,13 +349,6 @@ class StageEquations:
     def touches(self) -> bool:
         """Whether anything touches, or a term acts that limits steps, at the positions of the state."""
         return self.nears_limit or (self.contact is not None and self.contact.touches)
-
-    def update_stencils(self, x: Array, displacement: Array | None = None) -> None:
-        """Update the near pairs to positions x (n_local, 3), or to all along a displacement, and all arrays
-        to their ghosts; collective.
-        """
-        if self.contact is not None:
-            self.contact.update(x, displacement)
 
     def _follow_ghosts(self) -> None:
         """Resize all arrays to the layout's present ghosts; collective."""

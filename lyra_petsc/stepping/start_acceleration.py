@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.forces import StageForces
+from lyra_petsc.stepping.integrators.in_use import IntegratorsInUse
 from lyra_petsc.stepping.integrators.integrator import NeedsAcceleration
+from lyra_petsc.stepping.prescribed import Prescriptions
+from lyra_petsc.stepping.state import State
+from lyra_petsc.stepping.time_step import Evaluation, TimeStep
 
 if TYPE_CHECKING:
-    from lyra_petsc.stepping.stage_equations import StageEquations
-
+    from lyra_petsc.contact.scene_contact import SceneContact
 
 JUST_AFTER = 1e-3
 """Part of a step after which handles have the velocities with which it starts."""
@@ -30,6 +35,11 @@ class StartAcceleration:
     ----------
     events : list of float
         Times [s] at which forces may jump.
+    integrators : IntegratorsInUse
+    forces : StageForces
+    state : State
+    prescriptions : Prescriptions
+    contact : SceneContact or None
 
     Attributes
     ----------
@@ -42,84 +52,97 @@ class StartAcceleration:
 
     starts_anew = False
 
-    def __init__(self, events: list[float]) -> None:
-        self._events = events
+    def __init__(
+        self,
+        events: list[float],
+        integrators: IntegratorsInUse,
+        forces: StageForces,
+        state: State,
+        prescriptions: Prescriptions,
+        contact: SceneContact | None,
+    ) -> None:
+        self._events, self._integrators, self._forces = events, integrators, forces
+        self._state, self._prescriptions, self._contact = state, prescriptions, contact
         self.followers: list[NeedsAcceleration] = []
 
-    def begin_step(self, equations: StageEquations, at: float) -> None:
-        """Compute accelerations at the start of the step where they are needed; collective.
+    def begin_step(self, step: TimeStep, x: Array) -> None:
+        """Compute accelerations at the start of a step, with frozen positions x (n_local, 3), where they are
+        needed; collective.
 
-        ``at`` [s] is the time of the step's stage. Whether forces jump at the start of the step is decided by
-        its time alone, so that a resumed run decides alike.
+        Whether forces jump at the start of the step is decided by its time alone, so that a resumed run
+        decides alike.
         """
-        everyone = (equations.integrator, *self.followers)
-        jumping = {equations.integrators.usual, equations.integrators.in_contact, *everyone}
+        integrators = self._integrators
+        everyone = (integrators.present, *self.followers)
         # the start of a step may differ from the time of an event by round-off
-        if any(abs(equations.step.start - event) <= 1e-6 * equations.step.dt for event in self._events):
-            for each in jumping:
-                each.restart()
-        self.starts_anew = equations.integrator.needs_acceleration
-        asking = [each for each in everyone if each.needs_acceleration]
-        if not asking:
-            return
-        acceleration = _computed(equations, at)
-        for each in asking:
-            each.set_acceleration(acceleration)
+        if any(abs(step.start - event) <= 1e-6 * step.dt for event in self._events):
+            for follower in {integrators.usual, integrators.in_contact, *everyone}:
+                follower.restart()
+        self.starts_anew = integrators.present.needs_acceleration
+        asking = [follower for follower in everyone if follower.needs_acceleration]
+        if asking:
+            acceleration = self._computed(step, x)
+            for follower in asking:
+                follower.set_acceleration(acceleration)
 
+    def _computed(self, step: TimeStep, x: Array) -> Array:
+        """Accelerations (n_owned, 3) [m/s²] of the free unknowns at the start of the step; collective."""
+        forces, state, layout = self._forces, self._state, self._forces.layout
+        active, mass, v = forces.active, forces.mass[:, None], state.v.copy()
+        if step.dt > 0.0:
+            # of handles just after the start, where they may jump
+            soon = step.start + JUST_AFTER * step.dt
+            rates = self._prescriptions.rates(step.prescribed, step.start, step.end, soon)
+            step.prescribed.overwrite(v[: len(mass)], rates)
+        layout.update_ghosts(v)
+        if active.moving or active.external:
+            # at the stage targets are farther, and an obstacle may be where the sheet still is now
+            there = step.upcoming(step.start, x, self._prescriptions.reference)
+            step = replace(step, frozen=active.with_targets(step.frozen, there))
+        if forces.damps and layout.n_edges_global:
+            self._balance_moments(step, v)
+        force = self._out_of_balance(step, v)
+        acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
+        if self._contact is None:
+            return acceleration
+        order = self._integrators.present.order
+        start = step.contact_end(layout, forces.mass, state.x, v, order)
+        return self._contact.hold(start, acceleration, step.frozen)
 
-def _computed(equations: StageEquations, at: float) -> Array:
-    """Accelerations (n_owned, 3) [m/s²] of the free unknowns at the start of the step; collective."""
-    x, v, step, active = equations.frozen_positions(at), equations.v.copy(), equations.step, equations.active
-    if equations.held and step.end > step.start:
-        # of handles just after the start, where they may jump
-        soon = step.start + JUST_AFTER * step.dt
-        rates = equations.prescriptions.rates(step.prescribed, step.start, step.end, soon)
-        step.prescribed.overwrite(v[: len(equations.mass)], rates)
-    equations.points.update_ghosts(v)
-    turns = bool(active.moving or active.external)
-    if turns:  # at the stage targets are farther, and an obstacle may be where the sheet still is now
-        equations.change(frozen=active.with_targets(step.frozen, equations.targets_at(step.start, x)))
-    if equations.damping.active and equations.points.n_edges_global:
-        _balance_moments(equations, v)
-    force, mass = equations.out_of_balance(v), equations.mass[:, None]
-    if turns:
-        equations.change(frozen=step.frozen)
-    acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
-    if equations.contact is None:
-        return acceleration
-    return equations.contact.hold(equations.step_end(v), acceleration, equations.step.frozen)
+    def _out_of_balance(self, step: TimeStep, v: Array) -> Array:
+        """Force (n_owned, 3) [N] on the free unknowns at the state's positions with velocities v."""
+        return self._forces.out_of_balance(Evaluation(step, self._state.x, v, self._forces))
 
+    def _balance_moments(self, step: TimeStep, v: Array) -> None:
+        """Set the rates of free directors, in v (n_local, 3) and in the state; collective.
 
-def _balance_moments(equations: StageEquations, v: Array) -> None:
-    """Set the rates of free directors, in v (n_local, 3) and in the state; collective.
-
-    Directors have no mass: damping balances their moments. Other rates would give the vertices the
-    accelerations of a sheet with stiffer directors. The method is that of conjugate gradients.
-    """
-    layout = equations.points
-    edges, free = slice(layout.n_vertices, layout.n_owned), equations.step.prescribed.free
-    diagonal, increment = np.zeros_like(v), np.zeros_like(v)
-    for term in equations.active.with_edges:
-        if term.registration.damped:
-            damping = term.elements.data["damping"]
-            diagonal.reshape(-1)[term.edge_indices] += term.edge_stiffness(damping)
-    scale = np.divide(1.0, diagonal[edges], out=np.zeros_like(v[edges]), where=diagonal[edges] > 0.0)
-    residual = equations.out_of_balance(v)[edges]
-    direction = scale * residual
-    square = first = layout.global_sum(float(np.vdot(residual, direction)))[0]
-    for _ in range(MAX_ITERATIONS):
-        increment[edges] = direction
-        layout.update_ghosts(increment)
-        product = np.where(free, equations.damping.product(increment), 0.0)[edges]
-        power = layout.global_sum(float(np.vdot(direction, product)))[0]
-        if not power > 0.0:
-            break
-        v[edges] += square / power * direction
-        residual -= square / power * product
-        before, square = square, layout.global_sum(float(np.vdot(residual, scale * residual)))[0]
-        if square <= ROUND_OFF**2 * first:
-            break
-        direction = scale * residual + square / before * direction
-    layout.update_ghosts(v)
-    equations.v[edges] = v[edges]
-    equations.state.update_ghosts()
+        Directors have no mass: damping balances their moments. Other rates would give the vertices the
+        accelerations of a sheet with stiffer directors. The method is that of conjugate gradients.
+        """
+        layout = self._forces.layout
+        edges, free = slice(layout.n_vertices, layout.n_owned), step.prescribed.free
+        diagonal, increment = np.zeros_like(v), np.zeros_like(v)
+        for term in self._forces.active.with_edges:
+            if term.registration.damped:
+                damping = term.elements.data["damping"]
+                diagonal.reshape(-1)[term.edge_indices] += term.edge_stiffness(damping)
+        scale = np.divide(1.0, diagonal[edges], out=np.zeros_like(v[edges]), where=diagonal[edges] > 0.0)
+        residual = self._out_of_balance(step, v)[edges]
+        direction = scale * residual
+        square = first = layout.global_sum(float(np.vdot(residual, direction)))[0]
+        for _ in range(MAX_ITERATIONS):
+            increment[edges] = direction
+            layout.update_ghosts(increment)
+            damping = Evaluation(step, self._state.x, increment, self._forces).damping
+            product = np.where(free, damping, 0.0)[edges]
+            power = layout.global_sum(float(np.vdot(direction, product)))[0]
+            if not power > 0.0:
+                break
+            v[edges] += square / power * direction
+            residual -= square / power * product
+            before, square = square, layout.global_sum(float(np.vdot(residual, scale * residual)))[0]
+            if square <= ROUND_OFF**2 * first:
+                break
+            direction = scale * residual + square / before * direction
+        layout.update_ghosts(v)
+        self._state.set_edge_rates(v)

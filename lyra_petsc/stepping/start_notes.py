@@ -13,7 +13,7 @@ from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.topology import connected_pieces
 from lyra_petsc.scene.schema import Keyframe, Scene
 from lyra_petsc.scene.values import AXES
-from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.time_step import Evaluation
 from lyra_petsc.terms.registry import Registration, Role, make_term
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
@@ -23,14 +23,14 @@ BALANCED = 1e-9
 
 
 def nothing_acts(
-    scene: Scene, equations: StageEquations, times: Iterable[float], end: float, floor: float
+    scene: Scene, start: Evaluation, times: Iterable[float], end: float, floor: float
 ) -> list[str]:
     """A note if the sheet starts at rest and nothing will ever move it, else none; collective.
 
     Parameters
     ----------
-    equations : StageEquations
-        At the start.
+    start : Evaluation
+        Of the state at the start.
     times : iterable of float
         Times [s] at which loads begin or end.
     end : float
@@ -42,13 +42,17 @@ def nothing_acts(
     moves = any(frame != Keyframe(time=frame.time) for frames in motions for frame in frames)
     if moves or (scene.wind is not None and any(scene.wind.velocity)):
         return []
-    comm, stops = equations.points.comm, sorted({0.0, end, *(t for t in times if 0.0 < t < end)})
-    acting = float(np.abs(equations.v).max(initial=0.0))
+    comm, active, stops = (
+        start.forces.layout.comm,
+        start.forces.active,
+        sorted({0.0, end, *(t for t in times if 0.0 < t < end)}),
+    )
+    acting = float(np.abs(start.v).max(initial=0.0))
     for t0, t1 in itertools.pairwise(stops):
-        for load in equations.active.loads:
-            load.add_force(equations.x, t0, t1, force := np.zeros_like(equations.x))
+        for load in active.loads:
+            load.add_force(start.x, t0, t1, force := np.zeros_like(start.x))
             acting += float(np.abs(force).max(initial=0.0))
-    gradient = equations.gradient_of(equations.active.elastic, equations.x)
+    gradient = start.forces.sum(active.elastic, start.x, start.step.frozen)
     acting, square = comm.allreduce(np.array([acting, float(np.vdot(gradient, gradient))]))
     if acting > 0.0 or square > floor**2:
         return []

@@ -10,6 +10,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.linear.discretisation import Discretisation
 
 if TYPE_CHECKING:
+    from lyra_petsc.stepping.prescribed import PrescribedUnknowns
     from lyra_petsc.stepping.time_step import Evaluation
 
 
@@ -24,6 +25,7 @@ class State:
         The stage of the last step, if it is at these positions.
     """
 
+    _past_velocity: Array | None = None
     evaluation: Evaluation | None = None
 
     def __init__(self, discretisation: Discretisation) -> None:
@@ -44,9 +46,41 @@ class State:
         self.x[rows] = x[rows]
         self.update_ghosts()
 
+    def set_edge_rates(self, v: Array) -> None:
+        """Take the rates of edges from v (n_local, 3), ghosts up to date."""
+        layout = self._discretisation.layout
+        edges = ~layout.are_vertices(layout.global_number)
+        self.v[edges] = v[edges]
+
     def resize(self) -> None:
         """Resize to the layout's present ghosts; collective."""
         self.set(self.x, self.v)
+
+    def moved(self, duration: float) -> Array:
+        """Positions (n_local, 3) [m] after a time [s] at these velocities; unknowns of edges stay."""
+        layout, x = self._discretisation.layout, self.x + duration * self.v
+        if layout.n_edges_global:
+            edges = ~layout.are_vertices(layout.global_number)
+            x[edges] = self.x[edges]
+        return x
+
+    def expected_displacement(self, dt: float, held: PrescribedUnknowns, steps: int) -> Array:
+        """Displacements (n_local, 3) [m] of a step of dt [s] at constant velocities, of handles exactly;
+        collective.
+
+        Those of several ``steps`` are with the accelerations of the last step.
+        """
+        layout, displacement = self._discretisation.layout, steps * dt * self.v
+        n = layout.n_owned
+        if steps > 1 and self._past_velocity is not None:
+            displacement[:n] += 0.5 * steps**2 * dt * (self.v[:n] - self._past_velocity)
+        held.overwrite(displacement[:n], float(steps) * (held.goal - self.x[:n].take(held.indices)))
+        layout.update_ghosts(displacement)
+        return displacement
+
+    def keep_past(self, velocity: Array) -> None:
+        """Keep the velocities (n_owned, 3) [m/s] before the last step, for `expected_displacement`."""
+        self._past_velocity = velocity
 
     def set(self, x: Array, v: Array) -> None:
         """Set positions and velocities (n_owned, 3), in new arrays; collective."""

@@ -16,13 +16,13 @@ from lyra_petsc.linear import presets, reasons
 from lyra_petsc.linear.hierarchy import Surface
 from lyra_petsc.phases import FROZEN
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping import contact_steps, edge_solve
+from lyra_petsc.stepping import edge_solve
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.directors import turn_with_triangles, update_frames
 from lyra_petsc.stepping.edge_solve import EdgeSolve
 from lyra_petsc.stepping.newton.blend import HessianBlend
-from lyra_petsc.stepping.newton.conditioning import expected_iterations
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
+from lyra_petsc.stepping.newton.force_scales import expected_iterations
 from lyra_petsc.stepping.newton.initial_guess import has_start
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve
 from lyra_petsc.stepping.stage_equations import StageEquations
@@ -124,7 +124,7 @@ class Stepper:
             points.comm.size,
             static=static,
             newton=equations.integrator.iterates,
-            iterations=0.0 if static else expected_iterations(equations, step),
+            iterations=0.0 if static else expected_iterations(equations.forces, step),
             contact=equations.contact is not None,
         )
 
@@ -200,7 +200,7 @@ class Stepper:
             return Attempt(False, 0, 0, math.inf, message=message, failed_solve=failed)
         solves = [solver.solve(start)]
         while self._iterates and len(solves) < MAX_SOLVES and (reached := solves[-1].evaluation) is not None:
-            if not contact_steps.follow_contacts(equations, reached):
+            if not limits.follow_contacts(equations, reached):
                 break
             solves.append(solver.solve(start, reached.v[:n]))
         solution, message = solves[-1].evaluation, solves[-1].message

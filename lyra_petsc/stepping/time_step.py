@@ -9,12 +9,15 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.applied_loads import StepLoads
 from lyra_petsc.stepping.integrators.integrator import Stage
 from lyra_petsc.stepping.prescribed import PrescribedUnknowns
-from lyra_petsc.terms.term import Term
+from lyra_petsc.stepping.reference_positions import ReferencePositions
+from lyra_petsc.terms.term import Term, UpcomingStep
 
 if TYPE_CHECKING:
+    from lyra_petsc.contact.impacts import StepEnd
     from lyra_petsc.stepping.forces import StageForces
 
 _numbers = itertools.count()
@@ -77,6 +80,17 @@ class TimeStep:
     def at_stage(self) -> float:
         """Time [s] of the stage."""
         return self.start + self.stage.offset
+
+    def upcoming(self, time: float, x: Array, reference: ReferencePositions) -> UpcomingStep:
+        """The step as terms receive it to freeze their data at positions x (n_local, 3) and a time [s]."""
+        return UpcomingStep(self.start, self.end, time, x, reference.at)
+
+    def contact_end(self, layout: Layout, mass: Array, x: Array, v: Array, order: int) -> StepEnd:
+        """The end of the step with positions and velocities x, v (n_local, 3), for contact."""
+        from lyra_petsc.contact.impacts import StepEnd
+
+        held = self.prescribed
+        return StepEnd(layout, mass, held.free, held.indices, x, v, self.start, self.end, order)
 
     @property
     def ends_at_stage(self) -> bool:

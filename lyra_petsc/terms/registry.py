@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from importlib import import_module
 from types import ModuleType
@@ -226,9 +226,11 @@ def registration_of(name: str) -> Registration:
 
 
 def make_term(
-    entry: Registration, elements: Elements | None, scene: Scene, mass: NDArray[np.float64]
+    entry: Registration, elements: Elements | None, scene: Scene, mass: NDArray[np.float64], name: str = ""
 ) -> Term:
-    """The term on one rank, from its elements there and the mass (n_vertices,) [kg] of the vertices."""
+    """The term on one rank, from its elements there and the mass (n_vertices,) [kg] of the vertices; ``name``
+    instead of its own.
+    """
     term: Term = entry.module().make(elements, scene, mass)
-    term.registration = entry
+    term.registration = replace(entry, name=name) if name else entry
     return term

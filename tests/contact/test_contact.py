@@ -240,7 +240,7 @@ def test_forces_balance_at_boundaries_between_ranks(comm: MPI.Comm) -> None:
 
     def at_first(on: MPI.Comm) -> tuple[int, Array]:
         with Watched(on, scene) as run:
-            run.equations.set_references(0.0)
+            run.equations.reference.record_starts(0.0, run.equations.x)
             run.equations.begin_step(0.0, 0.01)
             x = run.equations.x
             total, largest = run.forces(x)

@@ -48,7 +48,9 @@ def test_spring_and_mass(
     for amplitude, speed in ((1.0, 0.0), (0.0, omega)):
         with Simulation({"mesh": triangle, "handles": [handle]}, MPI.COMM_SELF) as simulation:
             x = simulation.x
-            simulation.equations.set_references(0.0)  # the springs set out from here
+            simulation.equations.reference.record_starts(
+                0.0, simulation.equations.x
+            )  # the springs set out from here
             simulation.set_state(x=x + [0, 0, amplitude], v=np.tile([0.0, 0.0, speed], (3, 1)))
             simulation.step(omega_dt / omega)
             shift, velocity = simulation.x - x, simulation.v

@@ -32,7 +32,7 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import StepAccount
-from lyra_petsc.stepping.newton.roundoff import residual_roundoff
+from lyra_petsc.stepping.newton.force_scales import ROUNDOFF, residual_roundoff
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.stepping.state import resized
 from lyra_petsc.terms.bending.hinge import Bending
@@ -43,9 +43,6 @@ from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 if TYPE_CHECKING:
     from lyra_petsc.contact.barrier import ContactBarrier
-
-EPSILON = 10.0 * float(np.finfo(np.float64).eps)
-"""Relative round-off of a sum, as in `residual_roundoff`."""
 
 CONTACT_PANELS, HALVED_PANELS, MAX_PANELS = 16, 128, 1024
 """Fewest panels of the integral for contact, which has at least one for each half gap, as a barrier is as
@@ -113,7 +110,7 @@ def force_work(
             points=np.linspace(0.0, 1.0, panels + 1)[1:-1],
             quadrature="gk15",
             epsabs=tolerance,
-            epsrel=EPSILON,
+            epsrel=ROUNDOFF,
             limit=panels + HALVED_PANELS,
             full_output=True,
         )
@@ -261,7 +258,7 @@ class BalanceRecorder:
         if self._identity:  # x' − x equals Δt v' only to the last digit of x
             noise += powers + account.before.kinetic + account.after.kinetic + heights
             floor += left["residual"] * math.sqrt(free_dx)
-        tolerance = floor + EPSILON * noise
+        tolerance = floor + ROUNDOFF * noise
         work, jumped = force_work(comm, n, sheet, frames, x0, dx, 0.1 * tolerance)
         change = account.after.elastic - account.before.elastic + account.fabric_heat
         sizes = [change, work]
@@ -286,7 +283,7 @@ class BalanceRecorder:
         everything = [*parts.values(), np.asarray(sum(parts.values()))]
         squares = equations.points.global_sum(*(float(np.sum(part**2, where=free)) for part in everything))
         *each, residual = np.sqrt(squares).tolist()
-        floor = residual_roundoff(equations, max(reach, simulation.problem.whole.largest_coordinate))
+        floor = residual_roundoff(equations.forces, max(reach, simulation.problem.whole.largest_coordinate))
         n = len(free)
         displacement = equations.x[:n] - self._x[:n] - dt * self._v[:n]
         return {
@@ -370,7 +367,7 @@ class BalanceRecorder:
         for term, frozen in self._frozen(self._sheet_terms).items():
             each = np.abs(term.energies(x, frozen))
             scale = reach * term.force_scale(reach)[: term.n_owned]
-            amount += float(np.sum(each + np.sqrt(2.0 * each * scale))) + EPSILON * float(np.sum(scale))
+            amount += float(np.sum(each + np.sqrt(2.0 * each * scale))) + ROUNDOFF * float(np.sum(scale))
         return amount
 
     def _momentum_defects(
@@ -395,7 +392,7 @@ class BalanceRecorder:
         internal, damping = within
         damped = dt * (sum(parts.values()) - internal - reaction)
         linear = (damped - dt * damping)[rows].sum(axis=0)
-        noise = EPSILON * forces * dt
+        noise = ROUNDOFF * forces * dt
         found = {
             "momentum": float(np.abs(comm.allreduce(linear)).max()),
             "momentum_tolerance": dt * left * math.sqrt(equations.points.n_global) + noise,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from petsc4py import PETSc
 
@@ -9,7 +11,7 @@ from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.reasons import NOT_A_NUMBER
 from lyra_petsc.scene.schema import Solver
 from lyra_petsc.stepping.motion_limits import may_impact
-from lyra_petsc.stepping.newton.roundoff import limit_roundoff
+from lyra_petsc.stepping.newton.force_scales import limit_roundoff
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 Reason = PETSc.SNES.ConvergedReason
@@ -96,6 +98,14 @@ class Convergence:
         self._balanced = self._ended = self._met_tolerances = False
         self._after_correction = np.inf
 
+    def saved_state(self) -> dict[str, float]:
+        """Entries of a checkpoint, for `restore`."""
+        return {"usual": self.mean_iterations}
+
+    def restore(self, saved: Mapping[str, float]) -> None:
+        """Restore a `saved_state`."""
+        self.mean_iterations = saved["usual"]
+
     def accepts_last_iterate(self) -> bool:
         """Whether the solve is good where this test or a line search ended it; collective.
 
@@ -172,7 +182,7 @@ class Convergence:
     def _raise_floor(self) -> None:
         """Include the round-off of limits at the positions last evaluated in the floor; collective."""
         if self._equations.near or self._equations.active.limiting:
-            self._floor = max(self._minimum_floor, limit_roundoff(self._equations))
+            self._floor = max(self._minimum_floor, limit_roundoff(self._equations.evaluated))
 
     def _needs_finer_solve(self, tolerance: float) -> bool:
         """Whether a solve that meets the tolerances needs one more iteration because parts may collide.

@@ -7,6 +7,8 @@ smaller, until the residual falls.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from petsc4py import PETSc
 
 from lyra_petsc.stepping.newton.convergence import Convergence
@@ -102,6 +104,14 @@ class Forcing:
         self._buckles = True
         if self._near and not self._fixed:
             self._ksp.setTolerances(rtol=min(self._ksp.getTolerances()[0], BUCKLING))
+
+    def saved_state(self) -> dict[str, float]:
+        """Entries of a checkpoint, for `restore`."""
+        return {"tolerance": self.tolerance}
+
+    def restore(self, saved: Mapping[str, float]) -> None:
+        """Restore a `saved_state`."""
+        self.tolerance = saved["tolerance"]
 
     def before_solve(self, convergence: Convergence) -> None:
         """Set the tolerance for the next linear solve; collective."""

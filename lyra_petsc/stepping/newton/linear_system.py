@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+import numpy as np
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
@@ -18,7 +19,6 @@ from lyra_petsc.linear.multigrid import Multigrid
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.pivots import is_incomplete, shows_negative_curvature
 from lyra_petsc.phases import JACOBIAN_AGAIN, logged
-from lyra_petsc.stepping import contact_steps
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.time_step import Evaluation
 
@@ -222,7 +222,14 @@ class LinearSystem:
             )
 
     def _block_summary(self) -> list[str]:
-        return contact_steps.block_summary(self._equations)
+        """Lines of text on the blocks that near pairs add to the matrix."""
+        equations, discretisation = self._equations, self._equations.discretisation
+        if equations.contact is None:
+            return []
+        numbers = [rows.pattern.n_couplings for rows in (discretisation.fixed, discretisation.rows)]
+        fixed, every = equations.points.global_sum(*numbers).astype(np.int64)
+        pairs = equations.contact.summary(equations.evaluated.x, equations.step.frozen)
+        return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({pairs})"]
 
     def _hierarchy(self, *, spare: bool) -> Hierarchy:
         discretisation = self._equations.discretisation
@@ -237,7 +244,10 @@ class LinearSystem:
                 VertexEquations,  # needed with edge unknowns only
             )
 
-            vertex_matrix = VertexEquations(self._equations)
+            equations = self._equations
+            vertex_matrix = VertexEquations(
+                equations.forces, lambda: equations.evaluated, lagged=equations.integrator.lagged_loads
+            )
         return Hierarchy(
             discretisation.layout, discretisation.rows.pattern, found, vertex_matrix, spare=spare
         )
@@ -334,10 +344,16 @@ class LinearSystem:
             self._saved_rows.append(self.preconditioner.rows.copy())
 
     def assemble_with(self, add: Callable[[Array], None]) -> None:
-        """Set the matrices to the saved block rows, and what ``add`` adds to them."""
+        """Set the matrices to the saved block rows and what ``add`` adds to them, prescribed unknowns
+        decoupled.
+        """
+        prescribed = self._equations.step.prescribed
+        constrained = self._equations.forces.constrained(prescribed)
         for matrix, rows in zip((self.operator, self.preconditioner), self._saved_rows, strict=False):
             matrix.rows[:] = rows
             add(matrix.rows)
+            if len(constrained.changed):
+                self._rows.constrain(matrix.rows, prescribed.mask, constrained)
         self.operator.set(self.operator.rows)
         if self.preconditioner is not self.operator:
             own = self.preconditioner if len(self._saved_rows) > 1 else self.operator

@@ -9,7 +9,6 @@ from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
-from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.time_step import Evaluation
 
 
@@ -19,7 +18,6 @@ class RepeatedSolves:
     Parameters
     ----------
     ksp : PETSc.KSP
-    equations : StageEquations
     linear : LinearSystem
     at : callable
         Returns the evaluation of the equations at Newton's iterate.
@@ -36,13 +34,12 @@ class RepeatedSolves:
     def __init__(
         self,
         ksp: PETSc.KSP,
-        equations: StageEquations,
         linear: LinearSystem,
         at: Callable[[], Evaluation],
         renew: Callable[[], None],
         ease: Callable[[], bool],
     ) -> None:
-        self._ksp, self._equations, self._linear, self._at = ksp, equations, linear, at
+        self._ksp, self._linear, self._at = ksp, linear, at
         self._renew, self._ease = renew, ease
         self.iterations = 0
 
@@ -70,14 +67,8 @@ class RepeatedSolves:
         """Solve for z after ``add`` has added to the block rows (n_blocks, 3, 3), to a residual of at most
         ``tolerance`` [N]; whether it succeeded with a direction of descent.
         """
-        ksp, equations = self._ksp, self._equations
-
-        def constrained(values: Array) -> None:
-            add(values)
-            if len((entries := equations.forces.constrained(equations.step.prescribed)).changed):
-                equations.discretisation.rows.constrain(values, equations.step.prescribed.mask, entries)
-
-        self._linear.assemble_with(constrained)
+        ksp = self._ksp
+        self._linear.assemble_with(add)
         ksp.setOperators(self._linear.operator.mat, self._linear.preconditioner.mat)
         kept = ksp.getTolerances()
         ksp.setTolerances(rtol=1e-14, atol=tolerance)

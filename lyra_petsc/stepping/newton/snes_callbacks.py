@@ -231,7 +231,7 @@ class NewtonCallbacks:
             self._linear.reassemble_operator(at(), self._blend.value)
             return self._ease_linear_solve(x)
 
-        solves = RepeatedSolves(self._ksp, self._equations, self._linear, at, renew, ease)
+        solves = RepeatedSolves(self._ksp, self._linear, at, renew, ease)
         model = ContactModel(*limits.contact_at(self._equations, self._array(x)))
         changed = model.improve(residual, y, solves, self.forcing.effective_tolerance)
         self.contact_iterations += solves.iterations
@@ -321,8 +321,8 @@ class NewtonCallbacks:
         """Entries of a checkpoint, so that a resumed run solves the next steps alike."""
         return {
             "convex": self._convex_at_start,
-            "tolerance": self.forcing.tolerance,
-            "usual": self.convergence.mean_iterations,
+            **self.forcing.saved_state(),
+            **self.convergence.saved_state(),
             **self._blend.saved_state(),
             **self._linear.shift.saved_state(),
         }
@@ -330,7 +330,8 @@ class NewtonCallbacks:
     def restore(self, saved: Mapping[str, float]) -> None:
         """Restore a `saved_state`."""
         self._convex_at_start = bool(saved["convex"])
-        self.forcing.tolerance, self.convergence.mean_iterations = saved["tolerance"], saved["usual"]
+        self.forcing.restore(saved)
+        self.convergence.restore(saved)
         self._blend.restore(saved)
         self._linear.shift.restore(saved)
 

@@ -7,12 +7,15 @@ unknowns reduces the error of the difference.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern
-from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.forces import StageForces
+from lyra_petsc.stepping.time_step import Evaluation
 from lyra_petsc.terms.bending.director_rotations import DirectorRotations
 from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.term import Coupling, Elastic, Viscous
@@ -23,8 +26,12 @@ class VertexEquations:
 
     Parameters
     ----------
-    equations : StageEquations
-        System of a scene with terms in ``active.coarse``.
+    forces : StageForces
+        Of a scene with terms in ``active.coarse``.
+    evaluated : callable
+        The stage evaluated last.
+    lagged : bool
+        Whether loads that depend on velocities are those at the start of a step.
 
     Attributes
     ----------
@@ -33,13 +40,11 @@ class VertexEquations:
         The edges' unknowns as functions of the vertices.
     """
 
-    def __init__(self, equations: StageEquations) -> None:
-        self._equations, layout = equations, equations.points
-        self._bent = next(term for term in equations.active.elastic if isinstance(term, MidEdge))
-        self._elastic: list[Elastic] = [
-            equations.active.coarse.get(term, term) for term in equations.active.elastic
-        ]
-        self._viscous: list[Viscous] = [] if equations.integrator.lagged_loads else equations.active.viscous
+    def __init__(self, forces: StageForces, evaluated: Callable[[], Evaluation], *, lagged: bool) -> None:
+        self._forces, self._evaluated, layout, active = forces, evaluated, forces.layout, forces.active
+        self._bent = next(term for term in active.elastic if isinstance(term, MidEdge))
+        self._elastic: list[Elastic] = [active.coarse.get(term, term) for term in active.elastic]
+        self._viscous: list[Viscous] = [] if lagged else active.viscous
         couplings: dict[str, Coupling] = {}
         for term in (*self._elastic, *self._viscous):
             couplings |= term.couplings
@@ -61,28 +66,27 @@ class VertexEquations:
 
         Prescribed unknowns ``held`` (n_local, 3) are decoupled.
         """
-        equations, rows = self._equations, self._rows
-        x, vs = equations.evaluated.x, equations.evaluated.v
-        stage, damped = equations.step.stage, equations.damping.active
-        if (number := equations.step.prescribed.number) != self._held_number:
+        at, rows = self._evaluated(), self._rows
+        x, step, stage = at.x, at.step, at.step.stage
+        if (number := step.prescribed.number) != self._held_number:
             self._held_number = number
             self._hold(held)
         self.turns.update(x)
         values = memory[: 9 * self.pattern.n_blocks].reshape(-1, 3, 3)
-        rows.set_diagonal(stage.sigma * equations.mass, values)
+        rows.set_diagonal(stage.sigma * self._forces.mass, values)
         for term in self._elastic:
             weight: Array | float = stage.c
-            if damped and term.registration.damped:
+            if self._forces.damps and term.registration.damped:
                 weight = weight + term.elements.data["damping"]
-            rows.add_stiffness(term, x, equations.step.frozen.get(term), 1.0, weight, values)
+            rows.add_stiffness(term, x, step.frozen.get(term), 1.0, weight, values)
         for wind in self._viscous:
-            wind.add_hessian(vs, equations.step.frozen[wind], self.pattern.offsets, values)
+            wind.add_hessian(at.v, step.frozen[wind], self.pattern.offsets, values)
         if held.any():
-            self._add_clamps(x, values)
+            self._add_clamps(x, stage.c, values)
             rows.constrain(values, held, self._constrained)
         return values
 
-    def _add_clamps(self, x: Array, values: Array) -> None:
+    def _add_clamps(self, x: Array, c: float, values: Array) -> None:
         """Add the bending stiffness of triangles at prescribed directors.
 
         It acts on the third corner, at its height over the edge. There are no hinges at the border, and
@@ -94,9 +98,9 @@ class VertexEquations:
         edge = head - tail
         normal = np.cross(edge, opposite - tail)
         square = np.sum(normal * normal, axis=1)
-        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._equations.step.stage.c
-        if self._equations.damping.active:
-            factor *= 1.0 + data["damping"][triangle] / self._equations.step.stage.c
+        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * c
+        if self._forces.damps:
+            factor *= 1.0 + data["damping"][triangle] / c
         # n nᵀ / height²
         factor *= np.divide(
             np.sum(edge * edge, axis=1), square**2, out=np.zeros_like(square), where=square > 0.0

@@ -26,12 +26,12 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.scene.schema import Solver
-from lyra_petsc.stepping import contact_steps
+from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.directors import transport_frames
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
+from lyra_petsc.stepping.newton.force_scales import limit_roundoff
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve
-from lyra_petsc.stepping.newton.roundoff import limit_roundoff
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.buckled_shape import BuckledShape
 from lyra_petsc.stepping.statics.friction_balance import FrictionBalance
@@ -218,7 +218,7 @@ class Equilibrium:
                 self._predict_by_tangent(before, factor)
                 frozen = equations.step.frozen
             progress.record_force(force, attempt.linear_iterations if solves else None)
-            if solves and judges_energy and not contact_steps.has_friction_pairs(equations):
+            if solves and judges_energy and not limits.has_friction_pairs(equations):
                 progress.record_potential(self._potential_energy(x))
             balanced = solved_once and self._balanced(force, last)
             settled = self._friction.is_rough or (balanced and self._friction.is_settled())
@@ -397,7 +397,7 @@ class Equilibrium:
         """
         equations = self._equations
         ran_out = attempt.newton_iterations >= LEAP_ITERATIONS
-        if not ran_out or self._follows or contact_steps.has_friction_pairs(equations):
+        if not ran_out or self._follows or limits.has_friction_pairs(equations):
             return False
         lowest = self._stepper.lowest_energy_positions()
         if lowest is None:
@@ -445,7 +445,7 @@ class Equilibrium:
             if attempt is None or not attempt.converged:
                 equations.state.set(x, np.zeros_like(x))
                 equations.begin_step(before, factor)
-                equations.evaluate_at_start()
+                equations.evaluate(equations.stationary_velocity())
                 message = "from its lowest mode no other was found"
                 break
             followed += 1
@@ -558,7 +558,7 @@ class Equilibrium:
         """
         if force <= self._tolerances.force_tolerance * self._largest_force():
             return True
-        return PROGRESS * last <= force <= max(self._floor, limit_roundoff(self._equations))
+        return PROGRESS * last <= force <= max(self._floor, limit_roundoff(self._equations.evaluated))
 
     def _norm(self, vector: Array) -> float:
         return float(np.sqrt(self._equations.points.comm.allreduce(float(np.vdot(vector, vector)))))

@@ -66,7 +66,7 @@ class WholeStiffness:
             if iteration > 0 and self._balanced(force, last):
                 if not self._is_stable(factor):
                     break
-                equations.evaluate_at_start()
+                equations.evaluate(equations.stationary_velocity())
                 return Attempt(True, iteration, 0, force)
             displacement = self._displacement_by_force(unbalanced, factor) if np.isfinite(force) else None
             if displacement is None or force > MAX_GROWTH * last:
