@@ -1,16 +1,50 @@
-"""Energy guard: rejects steps in which the integrator creates energy. See `energy_gain` for the gain."""
+"""Energy guard: rejects steps in which the integrator creates energy.
+
+The gain of a step is ::
+
+    G = Δ(T + U + V) + D − W
+
+with the kinetic energy T of the free coordinates, all elastic energies U (springs and clamps too), the
+potential V of gravity, the heat D of material damping and the work W of handles, loads and wind.
+
+W is computed by the trapezoidal rule: half the sum of the forces at both ends of the step, wind and pressure
+with the geometry there, times the displacement. (With the integrator's own forces, at its stage, a run that
+blows up balances, too.) The work of a moving target is the change of stored energy by its motion, averaged
+over both ends, which for springs is the same rule. If the velocity of the integrator's stage is not Δx/Δt, D
+is the heat of uniform motion between the ends, with the geometry at its middle. It is the smallest heat that
+any motion makes; after a start from rest, the heat at the stage is several times as large. G is compared with
+the scale ::
+
+    S = largest value so far of T + U + |V − V₀| + Σ|W| + ΣD
+
+whose T includes the coordinates that handles drive: if these start gently, little else moves at first. T, V
+and W are those of an observer who moves with the scene's initial velocity: a sheet whose surroundings drift
+along with it is judged as one at rest. (Another observer finds another G, as the trapezoidal rule does not
+give the change of momentum.) G < 0 is numerical dissipation, which is allowed and summed up.
+
+Backward Euler has an identity instead, in which W is the work of the forces at the end of the step::
+
+    Δ(T + U + V) + D − W = −½ ‖Δv‖²_M + bracket        bracket = U(x_{n+1}) − U(x_n) − ∇U(x_{n+1})·Δx
+
+so that it gains energy only where U is not convex. Its steps are judged by the smaller of the two gains: if
+air brakes a sheet within a step, the force at its start times the displacement exceeds the work by far.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
+
+import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import EnergyBalance
-from lyra_petsc.stepping.energy_gain import EndForces, Gain
+from lyra_petsc.stepping.newton.force_scales import ROUNDOFF
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms.term import Elastic
 
 LARGEST_GAIN = 0.01
 """Gain of a step over S above which the step is repeated."""
@@ -28,7 +62,252 @@ ALTERNATIVES = {"midpoint": "bdf2", "alpha2": "bdf2", "bdf2": "beuler", "semi-im
 """The integrator to recommend in place of one that creates energy."""
 
 
-@dataclass
+@dataclass(frozen=True)
+class Gain:
+    """Gain of a step and what it consists of [J], the same on every rank.
+
+    Attributes
+    ----------
+    gain : float
+        G.
+    work, heat : float
+        W, D.
+    potential_before, potential : float
+        V at both ends of the step.
+    stored_before, stored : float
+        T + U at both ends, with the coordinates that handles drive.
+    inertia, bracket : float
+        ½ ‖Δv‖²_M, and this plus the change of energy that the work of the stage's forces does not explain.
+    noise : float
+        Round-off of the gain.
+    """
+
+    gain: float
+    work: float
+    heat: float
+    potential_before: float
+    potential: float
+    stored_before: float
+    stored: float
+    inertia: float
+    bracket: float
+    noise: float
+
+
+class EndForces:
+    """Works by the mean of the forces at both ends of a step, for an observer with the initial velocity;
+    collective.
+
+    Parameters
+    ----------
+    equations : StageEquations
+    drift : (3,)
+        The initial velocity [m/s].
+    """
+
+    def __init__(self, equations: StageEquations, drift: Sequence[float]) -> None:
+        self._equations = equations
+        elastic = equations.active.elastic
+        self._targets = [*equations.active.moving, *equations.active.external]
+        self._plain = [term for term in elastic if term not in self._targets]
+        self._weights = [load for load in equations.active.loads if load.registration.energy]
+        self._forces = [load for load in equations.active.loads if not load.registration.energy]
+        self._drift = np.array(drift)
+        # forces at the start of the step, if known as those at the end of the last, and at its end: gradients
+        # of ``_plain``, and forces of the wind
+        self._start: dict[str, Array] = {}
+        self._end: dict[str, Array] = {}
+
+    def keep_end(self) -> None:
+        """The present step is accepted: the next starts where it ends."""
+        self._start = self._end
+
+    def forget(self) -> None:
+        """The next step starts from another state."""
+        self._start = {}
+
+    def gain(self, x0: Array, v0: Array, ledger: EnergyBalance) -> Gain:
+        """Gain of the step just taken from x0, v0 (n_local, 3), whose account the ledger has."""
+        equations, layout = self._equations, self._equations.points
+        if equations.discretisation.stencils_change:  # ghosts may have changed in the step
+            x0, v0 = (layout.extended(values) for values in (x0, v0))
+        x1, v1, n, self._end = equations.x, equations.v, layout.n_owned, {}
+        moved = x1[:n] - x0[:n]
+        moved[: layout.n_vertices] -= equations.step.dt * self._drift
+        account, damping, uniform_heat = ledger.account, ledger.damping, 0.0
+        if uniform := self._moves_otherwise:
+            # at the middle, the displacements of a rotation cause no strain
+            force = equations.damping.product_at(0.5 * (x0 + x1), (x1 - x0) / equations.step.dt)
+            damping = force.take(equations.step.prescribed.indices)
+            uniform_heat = float(np.vdot(force, (x1 - x0)[: len(force)]))
+        work = self._load_work(x0, v0, x1, v1, moved) + self._handle_work(x0, x1, moved, damping)
+        by_targets, rise, springs0, springs1 = self._target_works(x0, x1)
+        # rounded positions at both ends of a step differ in energy, and in velocity
+        largest = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
+        stiff = (self._stiffness_sum + float(equations.mass.sum()) / equations.step.dt**2) * largest**2
+        energies = *self._kinetic(v0), *self._kinetic(v1), self._potential(x0, equations.step.start)
+        local = (
+            *energies,
+            self._potential(x1, equations.step.end),
+            work + by_targets,
+            rise,
+            springs0,
+            springs1,
+        )
+        sums = layout.global_sum(*local, stiff, uniform_heat).tolist()
+        free0, all0, free1, all1, potential0, potential1, work, rise, springs0, springs1, stiff, warm = sums
+        before, after = account.before, account.after
+        rise += (after.elastic - account.moving) - (before.elastic - account.moving_before)
+        more = warm - account.damping_heat if uniform else 0.0
+        heat = account.heat + more
+        energy0, energy1 = all0 + before.elastic + springs0, all1 + after.elastic + springs1
+        sizes = energy0 + energy1 + before.kinetic + after.kinetic + abs(work) + abs(heat)
+        sizes += abs(before.potential) + abs(after.potential)
+        return Gain(
+            gain=free1 - free0 + rise + potential1 - potential0 + heat - work,
+            work=work,
+            heat=heat,
+            potential_before=potential0,
+            potential=potential1,
+            stored_before=energy0,
+            stored=energy1,
+            inertia=account.inertia,
+            bracket=account.bracket + more,
+            noise=ROUNDOFF * (sizes + math.sqrt(2.0 * abs(energy1) * stiff) + ROUNDOFF * stiff),
+        )
+
+    def _kinetic(self, v: Array) -> tuple[float, float]:
+        """Kinetic energy [J] of this rank's free coordinates, and of all, at velocities v (n_local, 3)."""
+        equations = self._equations
+        at, square = equations.step.prescribed.indices, np.square(v[: len(equations.mass)] - self._drift)
+        driven, whole = (
+            np.vdot(equations.mass.take(at // 3), square.take(at)),
+            np.sum(equations.mass @ square),
+        )
+        return 0.5 * float(whole - driven), 0.5 * float(whole)
+
+    def _potential(self, x: Array, time: float) -> float:
+        """V [J] of this rank at positions x (n_local, 3) and a time [s]."""
+        x = x - time * self._drift if self._drift.any() else x
+        return sum(load.potential(x) for load in self._weights)
+
+    @property
+    def _moves_otherwise(self) -> bool:
+        """Whether velocities other than those of uniform motion between the ends damp the material."""
+        integrator = self._equations.integrator
+        return self._equations.damping.active and integrator.order > 1 and not integrator.moves_uniformly
+
+    def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
+        """Per-step data of terms, with their targets at time ``at`` [s] of the step."""
+        step = self._equations.targets_at(at, x)
+        return {term: term.freeze(step) for term in terms}
+
+    def _target_works(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
+        """Work [J] of the motion of targets and obstacles relative to the observer, change of the energies of
+        this rank's terms with targets, and energy of springs at both ends.
+        """
+        equations, rise, springs = self._equations, 0.0, [0.0, 0.0]
+        contact, work = (
+            equations.contact,
+            equations.contact_impulses.work if equations.contact_impulses else 0.0,
+        )
+        if contact is not None and contact.obstacles_move:
+            for x, time in ((x0, equations.step.start), (x1, equations.step.end)):
+                work += 0.5 * contact.barrier.work(x, time, equations.step.start, equations.step.end)
+        barrier = None if contact is None else contact.barrier
+        turning = [term for term in self._targets if term.n_elements and term is not barrier]
+        first = self._frozen(turning, equations.step.start, x0)
+        last = self._frozen(turning, equations.step.end, x1)
+        for term in turning:
+            frozen = first[term], last[term]
+            before, after = (float(term.energies(x, f).sum()) for x, f in zip((x0, x1), frozen, strict=True))
+            rise += after - before
+            if contact is not None and term is contact.friction:
+                work += contact.friction.work_of_targets((x0, x1), frozen)
+            else:  # the change of energy at fixed positions, averaged over both ends
+                changes = (term.energies(x, frozen[1]) - term.energies(x, frozen[0]) for x in (x0, x1))
+                work += 0.5 * sum(float(change.sum()) for change in changes)
+            if not term.registration.energy:
+                springs = [springs[0] + before, springs[1] + after]
+        if self._drift.any():
+            work += equations.step.dt * float(self._force_of_targets(x0, x1) @ self._drift)
+        return work, rise, springs[0], springs[1]
+
+    def _force_of_targets(self, x0: Array, x1: Array) -> Array:
+        """Force (3,) [N] of the sheet on targets and obstacles in the step from x0 to x1 (n_local, 3)."""
+        equations, force, contact = self._equations, np.zeros_like(x1), self._equations.contact
+        both: list[Elastic] = [term for term in self._targets if not term.registration.of_contact]
+        if contact is not None:
+            both.append(contact.barrier)
+        for x, time in ((x0, equations.step.start), (x1, equations.step.end)):
+            for term, frozen in self._frozen(both, time, x).items():
+                term.add_gradient(x, frozen, force)
+        force *= 0.5
+        if contact is not None and contact.friction is not None:
+            # by the force at the stage, which the impulses complete
+            friction = contact.friction
+            friction.add_gradient(equations.evaluated.x, equations.step.frozen[friction], force)
+        total: Array = force[: equations.points.n_vertices].sum(axis=0)
+        return total + (
+            equations.contact_impulses.loads[:, :3].sum(axis=0) if equations.contact_impulses else 0.0
+        )
+
+    def _load_work(self, x0: Array, v0: Array, x1: Array, v1: Array, moved: Array) -> float:
+        """Work [J] of wind and of loads without a potential on this rank's free coordinates."""
+        equations = self._equations
+        if not (self._forces or equations.active.viscous):
+            return 0.0
+        force = np.zeros_like(x1)
+        for load in self._forces:
+            for x in (x0, x1) if load.is_follower else (x1, x1):
+                load.add_force(x, equations.step.start, equations.step.end, force)
+        n = len(moved)
+        force = force[:n]
+        if equations.active.viscous:
+            start = self._start.get("wind")
+            force -= self._wind(x0, v0, n) if start is None else start
+            self._end["wind"] = end = self._wind(x1, v1, n)
+            force -= end
+        free = np.where(equations.step.prescribed.free, moved, 0.0)
+        return 0.5 * float(np.vdot(force, free))
+
+    def _wind(self, x: Array, v: Array, n: int) -> Array:
+        """Gradient (n, 3) [N] of the wind's potential at x and v (n_local, 3)."""
+        equations, out = self._equations, np.zeros_like(x)
+        step = equations.targets_at(equations.step.start, x)
+        for term in equations.active.viscous:
+            term.add_gradient(v, term.freeze(step), out)
+        return out[:n]
+
+    def _handle_work(self, x0: Array, x1: Array, moved: Array, damping: Array) -> float:
+        """Work [J] of exact handles on this rank, by the reactions to the sheet's forces and weight."""
+        equations, at = self._equations, self._equations.step.prescribed.indices
+        displacement = moved.take(at)
+        if not displacement.any():
+            return 0.0
+        start, end = self._start.get("pull"), equations.forces.sum(self._plain, x1, equations.step.frozen)
+        if start is None:
+            start = equations.forces.sum(self._plain, x0, equations.step.frozen)
+        self._end["pull"] = end
+        force = 0.5 * (start + end).take(at)
+        targets, weight = np.zeros_like(x1), np.zeros_like(x1)
+        for time, x in ((equations.step.start, x0), (equations.step.end, x1)):
+            for term, frozen in self._frozen(self._targets, time, x).items():
+                term.add_gradient(x, frozen, targets)
+        for load in self._weights:
+            load.add_force(x1, equations.step.start, equations.step.end, weight)
+        force += 0.5 * targets.ravel()[at] - weight.ravel()[at] + damping
+        if equations.contact_impulses:
+            force += equations.contact_impulses.handle_force
+        return float(np.vdot(force, displacement))
+
+    @cached_property
+    def _stiffness_sum(self) -> float:
+        """Sum [N/m] of the stiffnesses of this rank's elements."""
+        return sum(float(stiffness.sum()) for stiffness in self._equations.forces.stiffnesses.values())
+
+
+@dataclass(frozen=True)
 class GuardState:
     """State of the guard between steps; energies in J.
 
@@ -111,7 +390,7 @@ class EnergyGuard:
             self.gains = new
             self._forces.keep_end()
         else:
-            self.gains.repeated += 1
+            self.gains = replace(self.gains, repeated=self.gains.repeated + 1)
         return accepted
 
     @property
@@ -190,7 +469,7 @@ class EnergyGuard:
         """Restore a `saved_state`; without its gains if the integrator is another (not ``same``)."""
         self.gains = GuardState(**saved)
         if not same:
-            self.gains.total, self.gains.recent = 0.0, []
+            self.gains = replace(self.gains, total=0.0, recent=[])
 
 
 def _append_gain(recent: list[float], gain: float, window: int) -> list[float]:

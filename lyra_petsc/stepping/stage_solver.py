@@ -30,7 +30,7 @@ from lyra_petsc.stepping.directors import update_frames
 from lyra_petsc.stepping.newton.blend import HessianBlend
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
-from lyra_petsc.stepping.newton.inexact import LOOSEST, ONCE, ONCE_IN_CONTACT, STATIC
+from lyra_petsc.stepping.newton.inexact import CAREFUL, COLLIDING, LOOSEST, TIGHTEST
 from lyra_petsc.stepping.newton.initial_guess import first_guess
 from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
@@ -180,7 +180,7 @@ class StageSolver:
             )
         if not self._iterates:
             snes.setType(PETSc.SNES.Type.KSPONLY)
-            ksp.setTolerances(rtol=ONCE)
+            ksp.setTolerances(rtol=TIGHTEST)
             ksp.setInitialGuessNonzero(True)
             return
         snes.setMonitor(self._trace.monitor)
@@ -193,7 +193,7 @@ class StageSolver:
         snes.setLineSearchPreCheck(newton.correct_direction)
         # an indefinite Hessian costs an iteration, not the step
         snes.setMaxKSPFailures(scene.solver.max_iterations)
-        ksp.setTolerances(rtol=LOOSEST if equations.integrator.dynamic else STATIC)
+        ksp.setTolerances(rtol=LOOSEST if equations.integrator.dynamic else CAREFUL)
 
     def _take_options(self) -> None:
         ksp = self.ksp
@@ -261,7 +261,7 @@ class StageSolver:
         self.ts.setTimeStep(length)
         self.newton.begin_solve()
         if not self._iterates and not is_set("ksp_rtol"):
-            self.ksp.setTolerances(rtol=ONCE_IN_CONTACT if equations.near else ONCE)
+            self.ksp.setTolerances(rtol=COLLIDING if equations.near else TIGHTEST)
         self._trace.begin_solve()
         try:
             self.ts.step()

@@ -16,21 +16,17 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 
 Reason = PETSc.SNES.ConvergedReason
 
-STALLED = 0.5
-"""At the round-off floor an iteration that leaves more than this fraction of the residual has stalled."""
-
 FAST = 0.1
 """The preconditioner is kept after an iteration that leaves less than this fraction of the residual."""
 
 HALVED = 0.5
-"""The exact Hessian is factored again after an iteration that leaves less than this fraction."""
+"""Fraction of the residual below which an iteration is a good one: the exact Hessian is then factored again,
+and a correction is taken. Above it the iteration has stalled, at the round-off floor. Increments are
+extrapolated only if each is less than this fraction of the one before."""
 
 FINER_IN_CONTACT = 0.1
 """Where parts collide, one more iteration is taken unless this fraction of the tolerances is met: an impact
 magnifies the error of a step, which depends on the number of ranks."""
-
-SLOWEST = 0.5
-"""Increments are extrapolated only if each is less than this fraction of the one before."""
 
 RECENT = 0.1
 """Weight of the last Newton iteration in the running mean of linear iterations."""
@@ -144,7 +140,7 @@ class Convergence:
             self._estimate_remaining(moved)
             spent = linear_iterations - self._iterations_before
             self.mean_iterations += RECENT * (spent - self.mean_iterations)
-        slow = iteration > 0 and residual > STALLED * before
+        slow = not self.halved
         if slow:
             self._raise_floor()
         self._stalled = self._stalled + 1 if slow and residual <= self._floor else 0
@@ -209,7 +205,7 @@ class Convergence:
         (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.)
         """
         part = correction / last
-        expected = correction * part / (1.0 - part) if part < SLOWEST else np.inf
+        expected = correction * part / (1.0 - part) if part < HALVED else np.inf
         self._after_correction = expected * self._equations.step.stage.c
         tolerance = self._tolerances.step_tolerance * self.spacing
         return self._after_correction <= tolerance and residual <= self.force_tolerance()
@@ -222,5 +218,5 @@ class Convergence:
         """
         fell = increment / self._increment if self.fell_fast and self._increment > 0.0 else 1.0
         self._increment = increment
-        self.remaining = increment * (fell / (1.0 - fell) if fell < SLOWEST else 1.0)
+        self.remaining = increment * (fell / (1.0 - fell) if fell < HALVED else 1.0)
         self.remaining, self._after_correction = min(self.remaining, self._after_correction), np.inf

@@ -14,36 +14,28 @@ from petsc4py import PETSc
 from lyra_petsc.stepping.newton.convergence import Convergence
 
 LOOSEST, TIGHTEST = 1e-2, 1e-6
-"""Relative tolerances of the linear solver."""
+"""Relative tolerances of the linear solver in Newton's method. `TIGHTEST` is also that of the single linear
+solve of a semi-implicit step.
+
+In scenes with contact `LOOSEST` and `LOOSEST_IN_CONTACT` are also the linear residual of the solve that is
+expected to be a step's last one, over the residual that the step may leave: motions in contact magnify errors
+of solves, which depend on the number of ranks. It takes up to a quarter more linear iterations. Solves with
+multigrid hardly depend on the ranks, and have no such limit while no parts are near."""
 
 LOOSEST_IN_CONTACT = 1e-3
-"""The loosest tolerance where parts are near: looser solves cost more Newton iterations, each of which
-evaluates all pairs. Not with multigrid, whose iterations are expensive."""
+"""`LOOSEST` where parts are near: looser solves cost more Newton iterations, each of which evaluates all
+pairs. Not with multigrid, whose iterations are expensive."""
 
-STATIC = 1e-4
-"""Tolerance in a static analysis, where Newton steps are large and looser solves cost more of them."""
+CAREFUL = 1e-4
+"""Tolerance in a static analysis, where Newton steps are large and looser solves cost more of them; and in
+steps of a scene with contact in which no parts are near: errors of looser solves differ with the number of
+ranks and add up until parts meet. It saves one Newton iteration in three, and takes a third more linear
+iterations."""
 
-ONCE, ONCE_IN_CONTACT = 1e-6, 1e-9
-"""Tolerances of the single linear solve of a semi-implicit step, the second where parts are near.
-
-The second is also that of all solves of a step in which parts collide: an impact magnifies the error of a
-solve, which depends on the number of ranks, thirty to a hundred times."""
-
-NOTHING_NEAR = 1e-4
-"""Tolerance in steps of a scene with contact in which no parts are near.
-
-Errors of looser solves differ with the number of ranks and add up until parts meet. It saves one Newton
-iteration in three, and takes a third more linear iterations."""
-
-COLLISION = 1.0
-"""Approach of parts in a step, over the mean edge length, from which on they count as colliding: sheets then
-buckle into one of many shapes, and the first Newton steps decide into which."""
-
-LAST, LAST_FAR = 1e-3, 1e-2
-"""Linear residual of the solve that is expected to be a step's last one, over the residual that the step may
-leave, in scenes with contact; the second while no parts are near. Motions in contact magnify errors of
-solves, which depend on the number of ranks. It takes up to a quarter more linear iterations. Solves with
-multigrid hardly depend on the ranks, and have no such limit while no parts are near."""
+COLLIDING = 1e-9
+"""Tolerance of the single linear solve of a semi-implicit step where parts are near, and of all solves of a
+step in which parts collide: an impact magnifies the error of a solve, which depends on the number of ranks,
+thirty to a hundred times."""
 
 BUCKLING = 1e-5
 """Tolerance in steps in which the Hessian is indefinite while parts are near: the sheet buckles into one of
@@ -96,8 +88,8 @@ class Forcing:
         if self._fixed:
             return self.tolerance
         if self._collides:
-            return ONCE_IN_CONTACT
-        return min(self.tolerance, NOTHING_NEAR) if self._contact and not self._near else self.tolerance
+            return COLLIDING
+        return min(self.tolerance, CAREFUL) if self._contact and not self._near else self.tolerance
 
     def meet_negative_curvature(self) -> None:
         """Tighten the tolerance in the rest of the step, as its Hessian is indefinite."""
@@ -128,5 +120,5 @@ class Forcing:
         if self._contact and (self._near or not self._cycles):
             enough = convergence.force_tolerance()
             if 0.0 < tolerance * norm <= enough:
-                tolerance = min(tolerance, (LAST if self._near else LAST_FAR) * enough / norm)
+                tolerance = min(tolerance, (LOOSEST_IN_CONTACT if self._near else LOOSEST) * enough / norm)
         self._ksp.setTolerances(rtol=tolerance)

@@ -11,11 +11,8 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.arcs import Arcs, can_factor
-from lyra_petsc.stepping.newton.convergence import Convergence
+from lyra_petsc.stepping.newton.convergence import HALVED, Convergence
 from lyra_petsc.stepping.stage_equations import StageEquations
-
-MAX_REMAINING = 0.5
-"""A correction of a step is taken if it leaves less than this fraction of the residual."""
 
 MAX_CORRECTIONS = 8
 """Largest number of corrections of one step."""
@@ -71,7 +68,7 @@ class ShellSteps:
             if not limits.moves_freely(self._equations, v, increment):
                 break
             size, force = self._residual(v + increment)
-            if not size < MAX_REMAINING * before:
+            if not size < HALVED * before:
                 break
             corrected = True
             y.axpy(1.0, correction)

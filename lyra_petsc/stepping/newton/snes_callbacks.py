@@ -18,7 +18,7 @@ from lyra_petsc.stepping.directors import turn_with_triangles
 from lyra_petsc.stepping.newton.blend import HessianBlend
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.globalisation import Globalisation
-from lyra_petsc.stepping.newton.inexact import COLLISION, Forcing
+from lyra_petsc.stepping.newton.inexact import Forcing
 from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
@@ -32,11 +32,6 @@ SMALL_GAP = 0.005
 """Half the gap over the mean edge length below which `ContactModel` is used.
 
 With larger gaps it saved a tenth of the iterations and took twice the time."""
-
-MAX_INCREMENT = 1.0
-"""Largest displacement of a vertex, over the mean edge length, in a Newton iteration of an equilibrium while
-parts are near each other. Full steps of indefinite Hessians lead sheets that slide or fall far off, and
-Newton's method takes many iterations to return."""
 
 
 class NewtonCallbacks:
@@ -107,8 +102,9 @@ class NewtonCallbacks:
         self._step_length, self.step_fraction = 0.0, 1.0
         # the Hessian at the start of a step mostly resembles that at the start of the last step
         self._convex = self._convex_at_start
-        approach = COLLISION * self.convergence.spacing
-        collides = self._iterates and limits.may_collide(self._equations, approach)
+        # sheets that approach each other by an edge buckle into one of many shapes, and the first Newton
+        # steps decide into which
+        collides = self._iterates and limits.may_collide(self._equations, self.convergence.spacing)
         self._points.forget()
         self._linear.begin_solve()
         self._linear.shift.decrease()
@@ -293,13 +289,17 @@ class NewtonCallbacks:
         return shortened or separated is not None or fraction < 1.0
 
     def _limit_displacement(self, y: PETSc.Vec) -> bool:
-        """Shorten a step y to `MAX_INCREMENT` in equilibria in contact; whether y changed."""
+        """Shorten a step y to an edge length in equilibria in contact; whether y changed.
+
+        Full steps of indefinite Hessians lead sheets that slide or fall far off, and Newton's method takes
+        many iterations to return.
+        """
         equations = self._equations
         if equations.integrator.dynamic or not equations.near:
             return False
         vertices = self._array(y)[: equations.points.n_vertices]
         (largest,) = equations.points.global_max(float(np.abs(vertices).max(initial=0.0)))
-        allowed = MAX_INCREMENT * self.convergence.spacing / equations.step.stage.c
+        allowed = self.convergence.spacing / equations.step.stage.c
         if largest <= allowed:
             return False
         y.scale(allowed / largest)
