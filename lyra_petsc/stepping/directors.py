@@ -87,13 +87,13 @@ def update_frames(equations: StageEquations, x: Array) -> bool:
 
     Returns whether any changed, and with them the forces on vertices; collective.
     """
-    found: dict[Term, Any] = {}
+    frames: dict[Term, Any] = {}
     for term in () if equations.step.of_edges else equations.active.with_edges:
         updated = term.updated_frames(x, equations.step.frozen[term], equations.step.prescribed.mask)
-        found |= {} if updated is None else {term: updated}
-    if not equations.points.comm.allreduce(len(found), MPI.MAX):
+        frames |= {} if updated is None else {term: updated}
+    if not equations.points.comm.allreduce(len(frames), MPI.MAX):
         return False
-    equations.refreeze(found)
+    equations.refreeze(frames)
     return True
 
 
@@ -131,8 +131,8 @@ def match(equations: StageEquations, v: Array, increment: Array, curved: Array) 
     along = equations.displacement(v, curved)[1]
     x, displacement = equations.displacement(v, increment)
     for term in equations.active.with_edges:
-        found = term.edge_increments(x, displacement, equations.step.frozen[term], along)
-        _set(equations, curved, *found)
+        turned = term.edge_increments(x, displacement, equations.step.frozen[term], along)
+        _set(equations, curved, *turned)
 
 
 def _set(equations: StageEquations, increment: Array, indices: Ints, values: Array) -> bool:

@@ -298,15 +298,15 @@ class EnergyBalance:
     def columns(self) -> dict[str, float]:
         """Columns of history.csv that terms add, by name (the last term wins); collective."""
         equations = self._equations
-        found: dict[str, float] = dict(self.budget.more)
+        columns: dict[str, float] = dict(self.budget.more)
         for term in equations.active.elastic:
             reductions = term.registration.columns
             if not reductions:
                 continue
             mine = term.history(equations.x, equations.step.frozen[term])
             for name, how in reductions.items():
-                found[name] = float(equations.points.comm.allreduce(float(mine[name]), REDUCTIONS[how]))
-        return found
+                columns[name] = float(equations.points.comm.allreduce(float(mine[name]), REDUCTIONS[how]))
+        return columns
 
     def handle_forces(self, count: int) -> list[Array]:
         """Total force (3,) [N] of each of a scene's ``count`` handles in the last step; collective."""

@@ -448,18 +448,18 @@ class EnergyGuard:
     def content(self) -> dict[str, Any]:
         """Entry of summary.json: energies as fractions of the scale, which is in J."""
         gains, scale = self.gains, self.gains.scale or 1.0
-        found: dict[str, Any] = {
+        content: dict[str, Any] = {
             "scale": gains.scale,
             "numerical_dissipation": gains.lost / scale,
             "numerical_gain": gains.won / scale,
             "repeated": gains.repeated,
         }
         if self._is_backward_euler:
-            found["identity"] = {
+            content["identity"] = {
                 "velocity_changes": gains.inertia / scale,
                 "bracket": gains.bracket / scale,
             }
-        return found
+        return content
 
     def saved_state(self) -> dict[str, Any]:
         """Entry of a checkpoint."""

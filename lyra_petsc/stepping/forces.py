@@ -150,8 +150,8 @@ class StageForces:
         for term in self.active.elastic:
             if not term.n_elements:
                 continue
-            each = term.energies(at.x, frozen[term])
-            parts.append(rate * float(each.sum()))
+            energies = term.energies(at.x, frozen[term])
+            parts.append(rate * float(energies.sum()))
             of_size: float | Array = rate * step.size
             if isinstance(term, LimitsStep):
                 stiffness = term.stiffness(at.x, frozen[term])[: term.n_owned]
@@ -162,7 +162,7 @@ class StageForces:
             else:
                 stiffness = term.force_scale(1.0)[: term.n_owned]
             # `**` would raise an error where the square is infinite
-            square += 2.0 * float(np.vdot(each, stiffness * (of_size * of_size)))
+            square += 2.0 * float(np.vdot(energies, stiffness * (of_size * of_size)))
         parts.append(-rate * float(np.vdot(step.loads.force, at.x[:n] - step.x[:n])))
         if step.loads.following is not None:
             parts.append(rate * step.loads.following.energy(at.x))

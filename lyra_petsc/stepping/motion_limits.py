@@ -104,10 +104,10 @@ def find_start(equations: StageEquations) -> Array | None:
     if not equations.integrator.starts_at_rest:
         guesses.append(c * (equations.v[:n] - still))
     obstacles, pushes = equations.step.frozen[contact.barrier], len(guesses) > 1
-    found = contact.collisions.start(equations.x[:n], guesses, driven, free, obstacles, pushes=pushes)
-    if found is None:
+    displacement = contact.collisions.start(equations.x[:n], guesses, driven, free, obstacles, pushes=pushes)
+    if displacement is None:
         return None
-    start = still + found / c
+    start = still + displacement / c
     equations.prescribe(start)
     return start
 

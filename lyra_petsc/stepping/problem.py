@@ -209,12 +209,12 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
     elements: dict[str, Elements] = {}
     names: list[str] = []
     for entry in (needed := needed_terms(scene, rest.shells)):
-        found = entry.module().elements(rest)
-        if found is not None and len(found.stencil) == 0:
+        of_term = entry.module().elements(rest)
+        if of_term is not None and len(of_term.stencil) == 0:
             continue
         names.append(entry.name)
-        if found is not None:
-            elements[entry.name] = found
+        if of_term is not None:
+            elements[entry.name] = of_term
     spacing = mean_edge_length(mesh)
     largest = float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max()))
     check_resolved(spacing, largest, scene)
@@ -265,7 +265,7 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
             *nothing_holds(rest, needed, elements),
         ],
     )
-    on_edges = any(each.edges is not None for each in elements.values())
+    on_edges = any(of_term.edges is not None for of_term in elements.values())
     edges = rest.edges if on_edges else None
     return whole, GlobalMesh(
         mesh.n_vertices,

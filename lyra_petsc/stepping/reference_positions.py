@@ -53,7 +53,7 @@ class ReferencePositions:
 
     def at(self, start: float, rows: Ints) -> Array:
         """Positions (n, 3) [m] of local rows at a start; if it is to come, at the latest start so far."""
-        found = self._positions.get(start)
-        if found is None:
-            found = self._positions[max(self._positions)]
-        return found[np.searchsorted(self._rows, rows)]
+        positions = self._positions.get(start)
+        if positions is None:
+            positions = self._positions[max(self._positions)]
+        return positions[np.searchsorted(self._rows, rows)]

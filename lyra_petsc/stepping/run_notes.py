@@ -54,7 +54,7 @@ class RunNotes:
         if not self._repeats:
             return ""
         times = sum(self._repeats.values())
-        often = sorted(self._repeats.items(), key=lambda each: -each[1])
+        often = sorted(self._repeats.items(), key=lambda repeat: -repeat[1])
         reasons = "; ".join(f"{why}: {count} times" if count > 1 else f"{why}: once" for why, count in often)
         return (
             f"{times} {'attempt was' if times == 1 else 'attempts were'} repeated with a smaller {what}, "

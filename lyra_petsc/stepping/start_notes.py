@@ -71,7 +71,7 @@ def nothing_holds(
     """
     scene, mesh = rest.scene, rest.mesh
     # moments on edges have no resultant
-    on_edges = {name for name, each in elements.items() if each.edges is not None}
+    on_edges = {name for name, of_term in elements.items() if of_term.edges is not None}
     loads = [entry for entry in terms if entry.role is Role.LOAD and entry.name not in on_edges]
     if not scene.time.static or scene.contact is not None or not loads:
         return []

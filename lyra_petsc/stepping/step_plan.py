@@ -58,13 +58,13 @@ def _check_length(scene: Scene, control: StepControl) -> None:
     every, steps = scene.output.every, control.end / control.step
     if steps > MAX_STEPS:
         names = [f"-{name}" for name in ("ts_adapt_dt_max", *STEP_OPTIONS, "ts_max_time") if is_set(name)]
-        found = f"{control.step:g} s makes {steps:.3g} steps", MAX_STEPS, [*names, "time.step"][0]
+        excess = f"{control.step:g} s makes {steps:.3g} steps", MAX_STEPS, [*names, "time.step"][0]
     elif (states := steps if every is None else control.end / every) > MAX_STATES:
         step = control.step if every is None else every
-        found = f"{step:g} s makes {states:.3g} states", MAX_STATES, "output.every"
+        excess = f"{step:g} s makes {states:.3g} states", MAX_STATES, "output.every"
     else:
         return
-    count, maximum, key = found
+    count, maximum, key = excess
     raise InputError(
         f"{count} in {control.end:g} s; at most {maximum:g} are made: give more",
         file=None if key.startswith("-") else scene.source,

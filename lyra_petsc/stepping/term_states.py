@@ -35,24 +35,24 @@ def vertex_arrays(terms: Iterable[Stateful]) -> dict[str, Array]:
 
 def edge_arrays(terms: Iterable[Stateful], layout: Layout) -> dict[str, Array]:
     """The terms' arrays (n_edges,) of the owned edges with an unknown, by key."""
-    found = {}
+    arrays = {}
     for term, name, entry in _entries(terms, Place.EDGE):
         rows = np.zeros(3 * layout.n_local)
         rows[_edge_indices(term)] = entry.values
-        found[f"{term.name}.{name}"] = rows[layout.edge_indices]
-    return found
+        arrays[f"{term.name}.{name}"] = rows[layout.edge_indices]
+    return arrays
 
 
 def element_arrays(terms: Iterable[Stateful], layout: Layout) -> dict[str, Array]:
     """Rows (E, n + m) of owned elements, by term: n mesh numbers of vertices, then m values."""
-    found = {}
+    arrays = {}
     for term, _, entry in _entries(terms, Place.ELEMENT):
         vertices, values = entry.vertices, entry.values
         if vertices is None:
             vertices, values = layout.global_number[term.stencil[: term.n_owned]], values[: term.n_owned]
         numbers = layout.mesh_vertex_of_local()[layout.local(vertices.ravel())].reshape(vertices.shape)
-        found[term.name] = np.concatenate([numbers, values], axis=1)
-    return found
+        arrays[term.name] = np.concatenate([numbers, values], axis=1)
+    return arrays
 
 
 def restore_fixed(
@@ -69,18 +69,18 @@ def restore_fixed(
     numbers (E, n) of vertices and the values (E, m) of elements, each on any rank.
     """
     for term in terms:
-        found = {}
+        state = {}
         for name, entry in term.state().items():
             key = f"{term.name}.{name}"
             if entry.place is Place.VERTEX and key in arrays:
-                found[name] = arrays[key]
+                state[name] = arrays[key]
             elif entry.place is Place.EDGE and key in edges:
-                found[name] = _of_local_edges(layout, term, edges[key])
+                state[name] = _of_local_edges(layout, term, edges[key])
             elif entry.place is Place.ELEMENT and entry.vertices is None and term.name in elements:
                 rows = _send_to_owners(layout, *elements[term.name])
-                found[name] = _in_order(layout.global_number[term.stencil], *rows, entry.values)
-        if found:
-            term.restore(found, x)
+                state[name] = _in_order(layout.global_number[term.stencil], *rows, entry.values)
+        if state:
+            term.restore(state, x)
 
 
 def restore_changing(

@@ -41,10 +41,10 @@ def step_option() -> str:
     InputError
         If both are set.
     """
-    given = [name for name in STEP_OPTIONS if is_set(name)]
-    if len(given) > 1:
-        raise InputError("mean the same; leave one out", key=" and ".join(f"-{name}" for name in given))
-    return given[0] if given else STEP_OPTIONS[0]
+    names = [name for name in STEP_OPTIONS if is_set(name)]
+    if len(names) > 1:
+        raise InputError("mean the same; leave one out", key=" and ".join(f"-{name}" for name in names))
+    return names[0] if names else STEP_OPTIONS[0]
 
 
 def with_ts_options(scene: Scene) -> Scene:

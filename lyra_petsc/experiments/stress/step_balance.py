@@ -282,15 +282,15 @@ class BalanceRecorder:
         free = equations.step.prescribed.free
         everything = [*parts.values(), np.asarray(sum(parts.values()))]
         squares = equations.points.global_sum(*(float(np.sum(part**2, where=free)) for part in everything))
-        *each, residual = np.sqrt(squares).tolist()
+        *norms, residual = np.sqrt(squares).tolist()
         floor = residual_roundoff(equations.forces, max(reach, simulation.problem.whole.largest_coordinate))
         n = len(free)
         displacement = equations.x[:n] - self._x[:n] - dt * self._v[:n]
         return {
             "residual": residual,
-            "promised": max(simulation.scene.solver.force_tolerance * max(each), floor),
+            "promised": max(simulation.scene.solver.force_tolerance * max(norms), floor),
             "floor": floor,
-            "driving": max(norm for name, norm in zip(parts, each, strict=True) if name != "internal"),
+            "driving": max(norm for name, norm in zip(parts, norms, strict=True) if name != "internal"),
             "displacement": largest(equations.points.comm, np.where(free, displacement, 0.0)),
         }
 
@@ -365,9 +365,11 @@ class BalanceRecorder:
         """
         reach, amount = float(np.abs(x).max(initial=0.0)), 0.0
         for term, frozen in self._frozen(self._sheet_terms).items():
-            each = np.abs(term.energies(x, frozen))
+            energies = np.abs(term.energies(x, frozen))
             scale = reach * term.force_scale(reach)[: term.n_owned]
-            amount += float(np.sum(each + np.sqrt(2.0 * each * scale))) + ROUNDOFF * float(np.sum(scale))
+            amount += float(np.sum(energies + np.sqrt(2.0 * energies * scale))) + ROUNDOFF * float(
+                np.sum(scale)
+            )
         return amount
 
     def _momentum_defects(
@@ -393,12 +395,12 @@ class BalanceRecorder:
         damped = dt * (sum(parts.values()) - internal - reaction)
         linear = (damped - dt * damping)[rows].sum(axis=0)
         noise = ROUNDOFF * forces * dt
-        found = {
+        defects = {
             "momentum": float(np.abs(comm.allreduce(linear)).max()),
             "momentum_tolerance": dt * left * math.sqrt(equations.points.n_global) + noise,
         }
         if not self._identity:
-            return found
+            return defects
         x, mass = equations.x[:n], equations.mass[:, None]
         centre = comm.allreduce(np.append((mass * x).sum(axis=0), mass.sum()))
         arms = x[rows] - centre[:3] / centre[3]
@@ -408,7 +410,7 @@ class BalanceRecorder:
                 own = np.flatnonzero(term.edge_indices < 3 * n)
                 moment += term.moment(damped.ravel()[term.edge_indices[own]], own, equations.x, frozen)
         longest = math.sqrt(comm.allreduce(float(np.square(arms).sum())))
-        return found | {
+        return defects | {
             "angular": float(np.abs(comm.allreduce(moment)).max()),
             "angular_tolerance": dt * left * longest + noise * reach,
         }

@@ -40,17 +40,17 @@ class IntegratorsInUse:
     def record_step(self, x: Array, v: Array, free: Mask, dt: float) -> None:
         """Add the accepted step of dt [s] from x, v (n_owned, 3) to the histories."""
         followers = {self.in_contact} if self.present is self.usual else set()
-        for each in {self.present} | followers:
-            each.record_step(x, v, free, dt)
+        for integrator in {self.present} | followers:
+            integrator.record_step(x, v, free, dt)
 
     def follow_step(self, acceleration: Array) -> None:
         """Let those that did not take the step go on from its end, which had this mean acceleration (n_owned,
         3) [m/s²] of free unknowns.
         """
-        for each in {self.usual, self.in_contact} - {self.present}:
-            each.restart()
+        for integrator in {self.usual, self.in_contact} - {self.present}:
+            integrator.restart()
             if self.present.order == 1:  # velocities after an impact would give stiff damping huge forces
-                each.set_acceleration(acceleration)
+                integrator.set_acceleration(acceleration)
         self.present = self.usual
 
     def saved_state(self) -> tuple[dict[str, Array], dict[str, float]]:
@@ -60,5 +60,5 @@ class IntegratorsInUse:
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
         """Return to a `saved_state`."""
-        for each in {self.usual, self.in_contact}:
-            each.restore(arrays, numbers)
+        for integrator in {self.usual, self.in_contact}:
+            integrator.restore(arrays, numbers)

@@ -99,8 +99,8 @@ class Arcs:
 
     def _gradients(self, x: Array) -> Array:
         """∂x/∂X (E, 3, 2) of the triangles."""
-        found: Array = np.einsum("eci,eck->eik", x[self._term.stencil], self._slopes)
-        return found
+        gradients: Array = np.einsum("eci,eck->eik", x[self._term.stencil], self._slopes)
+        return gradients
 
     def _spin_and_strain(self, x: Array, displacement: Array) -> tuple[Array, Array, Array]:
         """F (E, 3, 2) at x (n_local, 3), and spins (E, 3) and strains (E, 3, 3) of a displacement from x."""
@@ -164,5 +164,5 @@ def _rotations(spin: Array) -> Array:
     zero = np.zeros_like(x)
     skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
     first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
-    found: Array = np.eye(3) + first * skew + second * (skew @ skew)
-    return found
+    rotations: Array = np.eye(3) + first * skew + second * (skew @ skew)
+    return rotations

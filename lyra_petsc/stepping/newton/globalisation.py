@@ -8,6 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.stage_equations import StageEquations
@@ -99,6 +100,14 @@ class Watchdog:
             self.best = None
 
 
+def descends(residual: PETSc.Vec, increment: Array, points: Layout) -> bool:
+    """Whether an increment (n_owned, 3) [m/s] of Newton's iterate reduces the objective to first order;
+    collective.
+    """
+    slope = float(np.vdot(residual.getArray(readonly=True), increment))
+    return bool(points.global_sum(slope)[0] < 0.0)
+
+
 ENERGY_ROUNDOFF = 1e-14
 """Differences of the objective below this fraction of its summands are noise."""
 
@@ -155,8 +164,8 @@ class Globalisation:
         best = self._watchdog.best
         if best is None or not self._watchdog.energy < self._first_energy:
             return None
-        found: Array = best.getArray(readonly=True).reshape(self._shape).copy()
-        return found
+        iterate: Array = best.getArray(readonly=True).reshape(self._shape).copy()
+        return iterate
 
     def return_to_best(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Make the step y return to the best iterate if full steps have failed; whether it does."""

@@ -34,12 +34,12 @@ class Iterates:
 
     def at(self, u: PETSc.Vec) -> Evaluation:
         """The evaluation of the equations at velocities u."""
-        found = self._known.get(self._key(u))
-        if found is not None:
-            return self._equations.revisit(found)
-        found = self._equations.linearised(u.getArray(readonly=True).reshape(-1, 3))
-        self._add(u, found)
-        return found
+        evaluation = self._known.get(self._key(u))
+        if evaluation is not None:
+            return self._equations.revisit(evaluation)
+        evaluation = self._equations.linearised(u.getArray(readonly=True).reshape(-1, 3))
+        self._add(u, evaluation)
+        return evaluation
 
     def reach(self, u: PETSc.Vec) -> None:
         """The SNES has copied the point of its last residual to its iterate u."""

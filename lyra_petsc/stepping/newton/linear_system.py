@@ -233,11 +233,11 @@ class LinearSystem:
 
     def _hierarchy(self, *, spare: bool) -> Hierarchy:
         discretisation = self._equations.discretisation
-        found = self._interpolations
-        if found is None:
-            found = interpolations(discretisation.layout, self._surface, multigrid.max_levels())
+        rows = self._interpolations
+        if rows is None:
+            rows = interpolations(discretisation.layout, self._surface, multigrid.max_levels())
         if discretisation.stencils_change:
-            self._interpolations = found
+            self._interpolations = rows
         vertex_matrix = None
         if self._equations.active.coarse and not discretisation.stencils_change:
             from lyra_petsc.stepping.newton.vertex_equations import (
@@ -248,9 +248,7 @@ class LinearSystem:
             vertex_matrix = VertexEquations(
                 equations.forces, lambda: equations.evaluated, lagged=equations.integrator.lagged_loads
             )
-        return Hierarchy(
-            discretisation.layout, discretisation.rows.pattern, found, vertex_matrix, spare=spare
-        )
+        return Hierarchy(discretisation.layout, discretisation.rows.pattern, rows, vertex_matrix, spare=spare)
 
     def attach(self, ksp: PETSc.KSP) -> None:
         """Attach to a KSP whose options are set."""

@@ -12,6 +12,7 @@ from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.arcs import Arcs, can_factor
 from lyra_petsc.stepping.newton.convergence import HALVED, Convergence
+from lyra_petsc.stepping.newton.globalisation import descends
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 MAX_CORRECTIONS = 8
@@ -94,16 +95,12 @@ class ShellSteps:
         """
         if self._arcs is None or not self._arcs.turns_notably(-_array(y)):
             return False
-        before = y.copy()
-        curved, increment = self._arcs.curve(v, -_array(y))
+        equations, (curved, increment) = self._equations, self._arcs.curve(v, -_array(y))
+        if not descends(residual, curved, equations.points) or not limits.moves_freely(equations, v, curved):
+            return False
         y.setArray(-curved.ravel())
-        descends = bool(residual.dot(y) > 0.0) and limits.moves_freely(self._equations, v, curved)
-        if descends:
-            self._equations.predicted_stress.take_uncorrected(self._equations.evaluate(v + increment).x)
-        else:
-            before.copy(y)
-        before.destroy()
-        return descends
+        equations.predicted_stress.take_uncorrected(equations.evaluate(v + increment).x)
+        return True
 
     def curve_guess(self, v: Array, start: Array, guess: Array) -> None:
         """Change a first guess (n_owned, 3) [m/s] far from v to one along arcs that moves freely from

@@ -17,7 +17,7 @@ from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.directors import turn_with_triangles
 from lyra_petsc.stepping.newton.blend import HessianBlend
 from lyra_petsc.stepping.newton.convergence import Convergence
-from lyra_petsc.stepping.newton.globalisation import Globalisation
+from lyra_petsc.stepping.newton.globalisation import Globalisation, descends
 from lyra_petsc.stepping.newton.inexact import Forcing
 from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
@@ -255,13 +255,10 @@ class NewtonCallbacks:
         increment = -self._array(y)
         if not turn_with_triangles(self._equations, self._array(x), increment):
             return False
-        before = y.copy()
+        if not descends(residual, increment, self._equations.points):
+            return False
         y.setArray(-increment.ravel())
-        descends = bool(residual.dot(y) > 0.0)
-        if not descends:
-            before.copy(y)
-        before.destroy()
-        return descends
+        return True
 
     def _limit_step(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Shorten a step y to what terms allow, or separate the pairs that it brings too near.
@@ -274,19 +271,14 @@ class NewtonCallbacks:
         slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_fast
         correct = fraction < 1.0 or slow
         separated = limits.separated(equations, v, -self._array(y)) if correct else None
-        if separated is not None:
-            before = y.copy()
-            y.setArray(-separated.ravel())
-            farther = limits.largest_step(equations, v, separated) if residual.dot(y) > 0.0 else 0.0
+        if separated is not None and descends(residual, separated, equations.points):
+            farther = limits.largest_step(equations, v, separated)
             if farther > 0.0 and farther >= fraction:
-                fraction = farther
-            else:
-                before.copy(y)
-                separated = None
-            before.destroy()
+                y.setArray(-separated.ravel())
+                fraction, shortened = farther, True
         self.step_fraction = fraction
         y.scale(fraction)
-        return shortened or separated is not None or fraction < 1.0
+        return shortened or fraction < 1.0
 
     def _limit_displacement(self, y: PETSc.Vec) -> bool:
         """Shorten a step y to an edge length in equilibria in contact; whether y changed.
