@@ -43,17 +43,15 @@ class Directors:
 
     def __init__(self, terms: Sequence[HasDirectors], layout: Layout) -> None:
         self._terms, self._comm = terms, layout.comm
-        self._end_frames: Frozen = {}  # at the end of the last step
         self.frozen_in_step: Frozen | None = None
         stiffness = np.zeros((layout.n_local, 3))
         for term in terms:
             stiffness.reshape(-1)[term.edge_indices] += MIN_EDGE_STIFFNESS * term.edge_stiffness()
         self.min_stiffness = stiffness[layout.n_vertices : layout.n_owned].max(axis=1)
 
-    def frames_differ(self, frozen: Frozen) -> bool:
-        """Whether the frames of a step that begins differ from those at the end of the last step."""
+    def begin_step(self) -> None:
+        """Forget the last step."""
         self.frozen_in_step = None
-        return any(frozen[term] is not self._end_frames.get(term) for term in self._terms)
 
     def frames_at_end(self, x: Array, frozen: Frozen) -> dict[Term, Any]:
         """Frames at the end x (n_local, 3) of a step that is one linear solve.
@@ -61,9 +59,7 @@ class Directors:
         The forces at the end are then those with which the next step begins.
         """
         self.frozen_in_step = frozen
-        ends: dict[Term, Any] = {term: term.frames_at_end(x, frozen[term]) for term in self._terms}
-        self._end_frames = ends
-        return ends
+        return {term: term.frames_at_end(x, frozen[term]) for term in self._terms}
 
     def forget(self) -> None:
         """Discard the remembered directors, whose memory the linear solve needs."""

@@ -49,7 +49,7 @@ class RunNotes:
         self._repeats[why] = self._repeats.get(why, 0) + 1
         self._smallest_dt = min(self._smallest_dt, dt)
 
-    def on_repeats(self, what: str, unit: str) -> str:
+    def on_repeats(self, quantity: str, unit: str) -> str:
         """How many attempts so far were repeated with a smaller step, and why; empty if none was."""
         if not self._repeats:
             return ""
@@ -57,7 +57,7 @@ class RunNotes:
         often = sorted(self._repeats.items(), key=lambda repeat: -repeat[1])
         reasons = "; ".join(f"{why}: {count} times" if count > 1 else f"{why}: once" for why, count in often)
         return (
-            f"{times} {'attempt was' if times == 1 else 'attempts were'} repeated with a smaller {what}, "
+            f"{times} {'attempt was' if times == 1 else 'attempts were'} repeated with a smaller {quantity}, "
             f"down to {self._smallest_dt:.3g}{unit} ({reasons})"
         )
 
@@ -78,6 +78,16 @@ class RunNotes:
         earlier = saved["notes"]
         self.earlier = len(earlier)
         self.texts[:] = [*earlier, *(note for note in self.texts if note not in earlier)]
+
+
+def note_of_repeats(run: SteppedScene) -> str:
+    """How many attempts of a run were repeated with a smaller step, and why; empty if none was."""
+    moves = run.problem.equations.integrator.dynamic
+    note = run.run_notes.on_repeats(*(("Δt", " s") if moves else ("increment", "")))
+    if not note or run.scene.time.adaptive or not moves:
+        return note
+    planned = math.ceil(run.time / run.control.step * (1.0 - 1e-9))
+    return f"{note}; {run.step_number} steps were taken where {planned} of the full Δt would do"
 
 
 def note_step(run: SteppedScene, attempt: Attempt) -> None:

@@ -31,7 +31,7 @@ from lyra_petsc.stepping.newton.force_scales import residual_roundoff
 from lyra_petsc.stepping.problem import Problem, build_problem, event_times
 from lyra_petsc.stepping.recovery import RejectedStep, Trouble, recover
 from lyra_petsc.stepping.resumption import resume, saved_state
-from lyra_petsc.stepping.run_notes import RunNotes, note_step
+from lyra_petsc.stepping.run_notes import RunNotes, note_of_repeats, note_step
 from lyra_petsc.stepping.start_notes import nothing_acts
 from lyra_petsc.stepping.statics.equilibrium import Equilibrium
 from lyra_petsc.stepping.statics.stability import Stability
@@ -178,12 +178,7 @@ class SteppedScene:
     @property
     def note_of_repeats(self) -> str:
         """How many attempts so far were repeated with a smaller step, and why; empty if none was."""
-        moves = self.problem.equations.integrator.dynamic
-        note = self.run_notes.on_repeats(*(("Δt", " s") if moves else ("increment", "")))
-        if not note or self.scene.time.adaptive or not moves:
-            return note
-        planned = math.ceil(self.time / self.control.step * (1.0 - 1e-9))
-        return f"{note}; {self.step_number} steps were taken where {planned} of the full Δt would do"
+        return note_of_repeats(self)
 
     @property
     def budget(self) -> Budget:

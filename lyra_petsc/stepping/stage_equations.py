@@ -196,10 +196,13 @@ class StageEquations:
         """Freeze geometry, targets and loads at the time ``at`` [s] of the stage."""
         x, lagged = self.frozen_positions(at), self.integrator.lagged_loads
         frozen = self.active.freeze(self.targets_at(at, x))
-        if self.directors.frames_differ(frozen) and self.integrator.dynamic:
-            self.state.evaluation = None
-        viscous = self.active.viscous if lagged else []
-        wind = self.forces.sum(viscous, self.v, frozen) if viscous else None
+        self.directors.begin_step()
+        known = self.state.evaluation
+        if known and any(frozen[term] is not known.step.frozen[term] for term in self.active.with_edges):
+            self.state.evaluation = None  # its forces are those with other frames
+        wind = (
+            self.forces.sum(self.active.viscous, self.v, frozen) if lagged and self.active.viscous else None
+        )
         times = self.step.start, self.step.end
         self.change(
             frozen=frozen,
