@@ -194,19 +194,17 @@ class StageEquations:
 
     def _freeze(self, at: float) -> None:
         """Freeze geometry, targets and loads at the time ``at`` [s] of the stage."""
-        x, lagged = self.frozen_positions(at), self.integrator.lagged_loads
+        x, lagged, step = self.frozen_positions(at), self.integrator.lagged_loads, self.step
         frozen = self.active.freeze(self.targets_at(at, x))
         self.directors.begin_step()
         known = self.state.evaluation
         if known and any(frozen[term] is not known.step.frozen[term] for term in self.active.with_edges):
             self.state.evaluation = None  # its forces are those with other frames
-        wind = (
-            self.forces.sum(self.active.viscous, self.v, frozen) if lagged and self.active.viscous else None
-        )
-        times = self.step.start, self.step.end
+        viscous = self.active.viscous if lagged else []
+        wind = self.forces.sum(viscous, self.v, frozen) if viscous else None
         self.change(
             frozen=frozen,
-            loads=self.load_case.loads(self.active.loads, *times, x, len(self.mass), wind),
+            loads=self.load_case.loads(self.active.loads, step.start, step.end, x, len(self.mass), wind),
             x=self.x,
             size=float(np.abs(self.x).max(initial=0.0)),
             linear=not self.integrator.iterates,
