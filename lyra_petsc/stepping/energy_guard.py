@@ -33,10 +33,10 @@ air brakes a sheet within a step, the force at its start times the displacement 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -94,6 +94,15 @@ class Gain:
     noise: float
 
 
+class StepEndState(NamedTuple):
+    """One end of a step: x, v (n_local, 3) at a time [s], and the terms' data with their targets there."""
+
+    x: Array
+    v: Array
+    time: float
+    frozen: dict[Elastic, Any]
+
+
 class EndForces:
     """Works by the mean of the forces at both ends of a step, for an observer with the initial velocity;
     collective.
@@ -131,7 +140,8 @@ class EndForces:
         equations, layout = self._equations, self._equations.points
         if equations.discretisation.stencils_change:  # ghosts may have changed in the step
             x0, v0 = (layout.extended(values) for values in (x0, v0))
-        x1, v1, n, self._end = equations.x, equations.v, layout.n_owned, {}
+        ends = self._at(x0, v0, equations.step.start), self._at(equations.x, equations.v, equations.step.end)
+        x1, n, self._end = equations.x, layout.n_owned, {}
         moved = x1[:n] - x0[:n]
         moved[: layout.n_vertices] -= equations.step.dt * self._drift
         account, damping, uniform_heat = ledger.account, ledger.damping, 0.0
@@ -140,22 +150,14 @@ class EndForces:
             force = equations.damping.product_at(0.5 * (x0 + x1), (x1 - x0) / equations.step.dt)
             damping = force.take(equations.step.prescribed.indices)
             uniform_heat = float(np.vdot(force, (x1 - x0)[: len(force)]))
-        work = self._load_work(x0, v0, x1, v1, moved) + self._handle_work(x0, x1, moved, damping)
-        by_targets, rise, springs0, springs1 = self._target_works(x0, x1)
+        work, *of_targets = self._target_works(ends)
+        work += self._load_work(ends, moved) + self._handle_work(ends, moved, damping)
         # rounded positions at both ends of a step differ in energy, and in velocity
         largest = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
         stiff = (self._stiffness_sum + float(equations.mass.sum()) / equations.step.dt**2) * largest**2
-        energies = *self._kinetic(v0), *self._kinetic(v1), self._potential(x0, equations.step.start)
-        local = (
-            *energies,
-            self._potential(x1, equations.step.end),
-            work + by_targets,
-            rise,
-            springs0,
-            springs1,
-        )
-        sums = layout.global_sum(*local, stiff, uniform_heat).tolist()
-        free0, all0, free1, all1, potential0, potential1, work, rise, springs0, springs1, stiff, warm = sums
+        energies = *self._energies(ends[0]), *self._energies(ends[1])
+        sums = layout.global_sum(*energies, work, *of_targets, stiff, uniform_heat).tolist()
+        free0, all0, potential0, free1, all1, potential1, work, rise, springs0, springs1, stiff, warm = sums
         before, after = account.before, account.after
         rise += (after.elastic - account.moving) - (before.elastic - account.moving_before)
         more = warm - account.damping_heat if uniform else 0.0
@@ -176,20 +178,23 @@ class EndForces:
             noise=ROUNDOFF * (sizes + math.sqrt(2.0 * abs(energy1) * stiff) + ROUNDOFF * stiff),
         )
 
-    def _kinetic(self, v: Array) -> tuple[float, float]:
-        """Kinetic energy [J] of this rank's free coordinates, and of all, at velocities v (n_local, 3)."""
-        equations = self._equations
-        at, square = equations.step.prescribed.indices, np.square(v[: len(equations.mass)] - self._drift)
+    def _at(self, x: Array, v: Array, time: float) -> StepEndState:
+        """The end of the step with x, v (n_local, 3) at ``time`` [s]."""
+        upcoming = self._equations.targets_at(time, x)
+        return StepEndState(x, v, time, {term: term.freeze(upcoming) for term in self._targets})
+
+    def _energies(self, end: StepEndState) -> tuple[float, float, float]:
+        """Kinetic energy [J] of this rank's free coordinates, and of all, and V."""
+        equations, x = self._equations, end.x
+        at, square = equations.step.prescribed.indices, np.square(end.v[: len(equations.mass)] - self._drift)
         driven, whole = (
             np.vdot(equations.mass.take(at // 3), square.take(at)),
             np.sum(equations.mass @ square),
         )
-        return 0.5 * float(whole - driven), 0.5 * float(whole)
-
-    def _potential(self, x: Array, time: float) -> float:
-        """V [J] of this rank at positions x (n_local, 3) and a time [s]."""
-        x = x - time * self._drift if self._drift.any() else x
-        return sum(load.potential(x) for load in self._weights)
+        if self._drift.any():
+            x = x - end.time * self._drift
+        potential = sum(load.potential(x) for load in self._weights)
+        return 0.5 * float(whole - driven), 0.5 * float(whole), potential
 
     @property
     def _moves_otherwise(self) -> bool:
@@ -197,106 +202,102 @@ class EndForces:
         integrator = self._equations.integrator
         return self._equations.damping.active and integrator.order > 1 and not integrator.moves_uniformly
 
-    def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
-        """Per-step data of terms, with their targets at time ``at`` [s] of the step."""
-        step = self._equations.targets_at(at, x)
-        return {term: term.freeze(step) for term in terms}
-
-    def _target_works(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
+    def _target_works(self, ends: tuple[StepEndState, StepEndState]) -> tuple[float, float, float, float]:
         """Work [J] of the motion of targets and obstacles relative to the observer, change of the energies of
         this rank's terms with targets, and energy of springs at both ends.
         """
         equations, rise, springs = self._equations, 0.0, [0.0, 0.0]
-        contact, work = (
-            equations.contact,
-            equations.contact_impulses.work if equations.contact_impulses else 0.0,
-        )
-        if contact is not None and contact.obstacles_move:
-            for x, time in ((x0, equations.step.start), (x1, equations.step.end)):
-                work += 0.5 * contact.barrier.work(x, time, equations.step.start, equations.step.end)
-        barrier = None if contact is None else contact.barrier
-        turning = [term for term in self._targets if term.n_elements and term is not barrier]
-        first = self._frozen(turning, equations.step.start, x0)
-        last = self._frozen(turning, equations.step.end, x1)
-        for term in turning:
-            frozen = first[term], last[term]
-            before, after = (float(term.energies(x, f).sum()) for x, f in zip((x0, x1), frozen, strict=True))
+        contact, impulses = equations.contact, equations.contact_impulses
+        work = impulses.work if impulses else 0.0
+        barrier = friction = None
+        if contact is not None:
+            barrier, friction = contact.barrier, contact.friction
+            if contact.obstacles_move:
+                times = equations.step.start, equations.step.end
+                work += 0.5 * sum(barrier.work(end.x, end.time, *times) for end in ends)
+        for term in self._targets:
+            if not term.n_elements or term is barrier:
+                continue
+            # by positions at both ends, and targets at both
+            table = [[float(term.energies(end.x, at.frozen[term]).sum()) for at in ends] for end in ends]
+            (before, later), (earlier, after) = table
             rise += after - before
-            if contact is not None and term is contact.friction:
-                work += contact.friction.work_of_targets((x0, x1), frozen)
+            if term is friction:
+                work += friction.work_of_targets(
+                    (ends[0].x, ends[1].x), (ends[0].frozen[term], ends[1].frozen[term])
+                )
             else:  # the change of energy at fixed positions, averaged over both ends
-                changes = (term.energies(x, frozen[1]) - term.energies(x, frozen[0]) for x in (x0, x1))
-                work += 0.5 * sum(float(change.sum()) for change in changes)
+                work += 0.5 * (later - before + after - earlier)
             if not term.registration.energy:
                 springs = [springs[0] + before, springs[1] + after]
         if self._drift.any():
-            work += equations.step.dt * float(self._force_of_targets(x0, x1) @ self._drift)
+            work += equations.step.dt * float(self._force_of_targets(ends) @ self._drift)
         return work, rise, springs[0], springs[1]
 
-    def _force_of_targets(self, x0: Array, x1: Array) -> Array:
-        """Force (3,) [N] of the sheet on targets and obstacles in the step from x0 to x1 (n_local, 3)."""
-        equations, force, contact = self._equations, np.zeros_like(x1), self._equations.contact
-        both: list[Elastic] = [term for term in self._targets if not term.registration.of_contact]
-        if contact is not None:
-            both.append(contact.barrier)
-        for x, time in ((x0, equations.step.start), (x1, equations.step.end)):
-            for term, frozen in self._frozen(both, time, x).items():
-                term.add_gradient(x, frozen, force)
+    def _force_of_targets(self, ends: tuple[StepEndState, StepEndState]) -> Array:
+        """Force (3,) [N] of the sheet on targets and obstacles in the step."""
+        equations, force, contact = self._equations, np.zeros_like(ends[0].x), self._equations.contact
+        for end in ends:
+            for term in self._targets:
+                if not term.registration.of_contact:
+                    term.add_gradient(end.x, end.frozen[term], force)
+            if contact is not None:
+                obstacles = contact.barrier.freeze(equations.targets_at(end.time, end.x))
+                contact.barrier.add_gradient(end.x, obstacles, force)
         force *= 0.5
         if contact is not None and contact.friction is not None:
             # by the force at the stage, which the impulses complete
             friction = contact.friction
             friction.add_gradient(equations.evaluated.x, equations.step.frozen[friction], force)
         total: Array = force[: equations.points.n_vertices].sum(axis=0)
-        return total + (
-            equations.contact_impulses.loads[:, :3].sum(axis=0) if equations.contact_impulses else 0.0
-        )
+        impulses = equations.contact_impulses
+        return total + (impulses.loads[:, :3].sum(axis=0) if impulses else 0.0)
 
-    def _load_work(self, x0: Array, v0: Array, x1: Array, v1: Array, moved: Array) -> float:
+    def _load_work(self, ends: tuple[StepEndState, StepEndState], moved: Array) -> float:
         """Work [J] of wind and of loads without a potential on this rank's free coordinates."""
-        equations = self._equations
+        equations, n = self._equations, len(moved)
         if not (self._forces or equations.active.viscous):
             return 0.0
-        force = np.zeros_like(x1)
+        force = np.zeros_like(ends[1].x)
         for load in self._forces:
-            for x in (x0, x1) if load.is_follower else (x1, x1):
+            for end in ends:
+                x = end.x if load.is_follower else ends[1].x
                 load.add_force(x, equations.step.start, equations.step.end, force)
-        n = len(moved)
         force = force[:n]
         if equations.active.viscous:
             start = self._start.get("wind")
-            force -= self._wind(x0, v0, n) if start is None else start
-            self._end["wind"] = end = self._wind(x1, v1, n)
-            force -= end
+            force -= self._wind(ends[0], n) if start is None else start
+            self._end["wind"] = wind = self._wind(ends[1], n)
+            force -= wind
         free = np.where(equations.step.prescribed.free, moved, 0.0)
         return 0.5 * float(np.vdot(force, free))
 
-    def _wind(self, x: Array, v: Array, n: int) -> Array:
-        """Gradient (n, 3) [N] of the wind's potential at x and v (n_local, 3)."""
-        equations, out = self._equations, np.zeros_like(x)
-        step = equations.targets_at(equations.step.start, x)
+    def _wind(self, end: StepEndState, n: int) -> Array:
+        """Gradient (n, 3) [N] of the wind's potential."""
+        equations, out = self._equations, np.zeros_like(end.x)
+        step = equations.targets_at(equations.step.start, end.x)
         for term in equations.active.viscous:
-            term.add_gradient(v, term.freeze(step), out)
+            term.add_gradient(end.v, term.freeze(step), out)
         return out[:n]
 
-    def _handle_work(self, x0: Array, x1: Array, moved: Array, damping: Array) -> float:
+    def _handle_work(self, ends: tuple[StepEndState, StepEndState], moved: Array, damping: Array) -> float:
         """Work [J] of exact handles on this rank, by the reactions to the sheet's forces and weight."""
-        equations, at = self._equations, self._equations.step.prescribed.indices
+        equations, step = self._equations, self._equations.step
+        at = step.prescribed.indices
         displacement = moved.take(at)
         if not displacement.any():
             return 0.0
-        start, end = self._start.get("pull"), equations.forces.sum(self._plain, x1, equations.step.frozen)
+        start = self._start.get("pull")
         if start is None:
-            start = equations.forces.sum(self._plain, x0, equations.step.frozen)
-        self._end["pull"] = end
-        force = 0.5 * (start + end).take(at)
-        targets, weight = np.zeros_like(x1), np.zeros_like(x1)
-        for time, x in ((equations.step.start, x0), (equations.step.end, x1)):
-            for term, frozen in self._frozen(self._targets, time, x).items():
-                term.add_gradient(x, frozen, targets)
+            start = equations.forces.sum(self._plain, ends[0].x, step.frozen)
+        self._end["pull"] = pull = equations.forces.sum(self._plain, ends[1].x, step.frozen)
+        targets, weight = np.zeros_like(ends[1].x), np.zeros_like(ends[1].x)
+        for end in ends:
+            for term in self._targets:
+                term.add_gradient(end.x, end.frozen[term], targets)
         for load in self._weights:
-            load.add_force(x1, equations.step.start, equations.step.end, weight)
-        force += 0.5 * targets.ravel()[at] - weight.ravel()[at] + damping
+            load.add_force(ends[1].x, step.start, step.end, weight)
+        force = 0.5 * ((start + pull).take(at) + targets.ravel()[at]) - weight.ravel()[at] + damping
         if equations.contact_impulses:
             force += equations.contact_impulses.handle_force
         return float(np.vdot(force, displacement))
