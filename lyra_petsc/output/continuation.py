@@ -144,7 +144,7 @@ def note_changes(simulation: SteppedScene, before: Path) -> tuple[list[Change], 
         with suppress(InputError):  # what is no scene is compared as text only
             earlier = on_root(comm, lambda: obstacle_motions(load_scene(before, meshes_needed=False)))
             now = obstacle_motions(scene)
-            earlier_motions = {n: each for n, each in earlier.items() if n in now and each != now[n]}
+            earlier_motions = {n: motion for n, motion in earlier.items() if n in now and motion != now[n]}
     for change in changes[:MAX_LISTED_CHANGES]:
         if change.key == "time.end":
             notes.append(str(change))

@@ -104,12 +104,12 @@ def _curvature(problem: Problem) -> Array:
 
 def _curvature_tensor(problem: Problem) -> Array:
     midedge = cast("MidEdge", problem.terms["midedge"])
-    found = midedge.curvatures(problem.equations.x, problem.equations.step.frozen[midedge])[: midedge.n_owned]
+    curvatures = midedge.curvatures(problem.equations.x, problem.equations.step.frozen[midedge])
     out = np.zeros((problem.membrane.n_owned, 3))  # stays zero for triangles without bending stiffness
     numbers = problem.membrane.elements.index[: len(out)]
     order = np.argsort(numbers)
     own = midedge.elements.data["triangle"][: midedge.n_owned]
-    out[order[np.searchsorted(numbers, own, sorter=order)]] = found
+    out[order[np.searchsorted(numbers, own, sorter=order)]] = curvatures[: midedge.n_owned]
     return six_components(out)
 
 

@@ -191,8 +191,10 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
         with open_stored(Path(path)) as file:
             stored = file[dataset]
             if stored.shape[:1] != (order.n_global,):
-                found = f"{dataset} has {stored.shape[0] if stored.shape else 'no'} rows"
-                raise InputError(f"{found}, {order.n_global} are expected", file=path)
+                rows = stored.shape[0] if stored.shape else "no"
+                raise InputError(
+                    f"{dataset} has {rows} rows, {order.n_global} are expected", file=path
+                )
             return np.asarray(stored[order.start : order.start + order.n_slab])
 
     return on_every_rank(order.comm, work)
@@ -207,7 +209,7 @@ def _create(path: Path, content: Mapping[str, NDArray[Any] | Empty], attributes:
         If the file cannot be created.
     """
     h5py = import_h5py()
-    data = sum(math.prod(each.shape) * each.dtype.itemsize for each in content.values())
+    data = sum(math.prod(rows.shape) * rows.dtype.itemsize for rows in content.values())
     texts = sum(len(str(value).encode()) for values in attributes.values() for value in values.values())
     early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
@@ -217,10 +219,10 @@ def _create(path: Path, content: Mapping[str, NDArray[Any] | Empty], attributes:
     # older formats of groups and headers have no check sums, and HDF5 crashes if they are damaged
     with h5py.File(path, "w", libver=("v108", "v108")) as file:
         owners = {"/": file}
-        for name, each in content.items():
-            owners[name] = file.create_dataset(name, each.shape, each.dtype, dcpl=early)
-            if isinstance(each, np.ndarray):
-                owners[name][...] = each
+        for name, rows in content.items():
+            owners[name] = file.create_dataset(name, rows.shape, rows.dtype, dcpl=early)
+            if isinstance(rows, np.ndarray):
+                owners[name][...] = rows
         for name, values in attributes.items():
             owner = owners[name] if name in owners else file.require_group(name)
             for key, value in values.items():

@@ -74,7 +74,7 @@ class StoredRun:
         self.times: Array = np.array([state.time for state in self._states])
         # a run that was resumed with other fields has them in some states only
         of_states = [{field.name: field for field in state.fields} for state in self._states]
-        self._fields = {n: field for n, field in of_states[0].items() if all(n in each for each in of_states)}
+        self._fields = {n: field for n, field in of_states[0].items() if all(n in state for state in of_states)}
         self.fields = tuple(self._fields)
 
     def refresh(self) -> bool:

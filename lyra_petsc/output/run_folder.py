@@ -140,7 +140,7 @@ class FolderChoice:
         The folder as the user would write it.
     resume : bool
         The folder holds a run to be resumed.
-    given : bool
+    named : bool
         The user named the folder or gave ``--force``; otherwise another name is chosen if another
         process creates the folder first.
     force : bool
@@ -152,7 +152,7 @@ class FolderChoice:
 
     path: Path
     resume: bool = False
-    given: bool = False
+    named: bool = False
     force: bool = False
     first: Path | None = None
     kind: FolderKind = RUN
@@ -199,7 +199,7 @@ def _choose_folder(
     if out is None:
         first = kind.parent / stem
         path = kind.newest(stem) if resume else first if force else free_name(first)
-        choice = FolderChoice(path, resume, given=force or resume, force=force, first=first, kind=kind)
+        choice = FolderChoice(path, resume, named=force or resume, force=force, first=first, kind=kind)
         key = "output folder"
         if path.is_symlink():
             raise InputError("is a link; name the folder to write to by --out", file=path, key=key)
@@ -208,7 +208,7 @@ def _choose_folder(
             raise InputError(f"must be the path of a folder, not {out!r}", key=key)
         if not os.fspath(out).strip():
             raise InputError("is empty; give the folder to write to", key=key)
-        choice = FolderChoice(possible_path(out, key), resume=resume, given=True, force=force, kind=kind)
+        choice = FolderChoice(possible_path(out, key), resume=resume, named=True, force=force, kind=kind)
     try:
         _check_choice(choice, key)
     except OSError as error:
@@ -229,7 +229,7 @@ def _check_choice(choice: FolderChoice, key: str) -> None:
             raise InputError(f"holds {kind.missing}; run without --resume", file=path, key="--resume")
         if kind.check is not None:
             kind.check(path)
-    elif choice.given and not choice.force and path.exists() and os.listdir(path) != [kind.lock]:
+    elif choice.named and not choice.force and path.exists() and os.listdir(path) != [kind.lock]:
         raise kind.exists_error(path, key)
     check_creatable(path, key)
 
@@ -337,7 +337,7 @@ class RunDirectory:
                 return path, self._lock.held
             except (FileExistsError, FolderLocked) as error:
                 self.release()
-                if not fresh or choice.given:
+                if not fresh or choice.named:
                     raise self._taken_error(path, error) from None
                 path = free_name(choice.first or choice.path)
             except OSError as error:

@@ -175,7 +175,7 @@ class StateWriter:
         first = self._next
         position = StoredField("position", "vertex", (self.vertices.n_global, 3), "float64")
         empty = {field.name: Empty(field.shape, np.dtype(field.dtype)) for field in (position, *fields)}
-        size = sum(each.dtype.itemsize * math.prod(each.shape) for each in empty.values())
+        size = sum(rows.dtype.itemsize * math.prod(rows.shape) for rows in empty.values())
         slots = max(1, min(max(first, MIN_STATES), MAX_STATES, MAX_BYTES // max(size, 1)))
         path = self.folder / f"states-{first:04d}.h5"
 
@@ -186,7 +186,7 @@ class StateWriter:
                 f"{TABLE}/sums": np.zeros((slots, len(empty)), np.uint64),
             }
             planned = {
-                f"{group_name(first + i)}/{name}": each for i in range(slots) for name, each in empty.items()
+                f"{group_name(first + i)}/{name}": rows for i in range(slots) for name, rows in empty.items()
             }
             columns = json.dumps([(field.name, field.on) for field in (position, *fields)])
             attributes: Attributes = {
@@ -273,15 +273,15 @@ def _undamaged_states(folder: Path) -> list[WrittenState]:
     InputError
         For links out of the folder.
     """
-    found: list[WrittenState] = []
+    states: list[WrittenState] = []
     for path in state_files(folder):
         try:
-            found += states_of(path)
+            states += states_of(path)
         except OutsideFolderError:
             raise
         except InputError:
             continue
-    return found
+    return states
 
 
 FAILURE_DATA, FAILURE_XDMF, FAILURE_TEXT = "failure.h5", "failure.xdmf", "failure.txt"

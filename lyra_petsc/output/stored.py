@@ -226,10 +226,10 @@ def read_stored(
     return array
 
 
-def _shape_matches(found: tuple[int, ...], shape: tuple[int | None, ...] | None) -> bool:
+def _shape_matches(stored: tuple[int, ...], shape: tuple[int | None, ...] | None) -> bool:
     if shape is None:
         return True
-    return len(found) == len(shape) and all(n in (None, m) for n, m in zip(shape, found, strict=True))
+    return len(stored) == len(shape) and all(n in (None, m) for n, m in zip(shape, stored, strict=True))
 
 
 def _expected_check_sum(file: Any, stored: Any, dataset: str) -> int:
@@ -367,7 +367,7 @@ class StoredMesh:
 
     def _indices(self, dataset: str, shape: tuple[int | None, ...], end: int) -> Ints:
         """A dataset of indices from 0 to ``end`` − 1."""
-        found = read_stored(self.path, dataset, shape, "iu")
-        if found.size and (found.min() < 0 or found.max() >= end):
+        indices = read_stored(self.path, dataset, shape, "iu")
+        if indices.size and (indices.min() < 0 or indices.max() >= end):
             raise InputError(f"is damaged: {dataset} holds numbers beyond 0 … {end - 1}", file=self.path)
-        return found
+        return indices

@@ -90,7 +90,7 @@ def library_versions() -> dict[str, str]:
     from petsc4py import PETSc
 
     h5py = import_h5py()
-    found = {
+    versions = {
         "lyra_petsc": lyra_petsc.__version__,
         "python": platform.python_version(),
         "numpy": np.__version__,
@@ -102,8 +102,8 @@ def library_versions() -> dict[str, str]:
         "hdf5": h5py.version.hdf5_version,
     }
     if "numba" in sys.modules:
-        found["numba"] = sys.modules["numba"].__version__
-    return found
+        versions["numba"] = sys.modules["numba"].__version__
+    return versions
 
 
 def _to_json(value: Any) -> Any:

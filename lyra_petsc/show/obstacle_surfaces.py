@@ -36,19 +36,19 @@ def run_obstacles(run: StoredRun) -> list[Solid | Container]:
     InputError
         If the run is damaged or lacks a mesh that its scene names.
     """
-    obstacles = run.scene.obstacles or {}
-    meshes = {name for name, obstacle in obstacles.items() if obstacle.mesh is not None}
+    specs = run.scene.obstacles or {}
+    meshes = {name for name, spec in specs.items() if spec.mesh is not None}
     stored = run.mesh.obstacles if meshes else {}
     if missing := meshes - stored.keys():
         raise InputError(f"does not hold the mesh of obstacle {min(missing)!r}", file=run.folder / MESH_FILE)
-    found = build_obstacles(run.scene, stored, Motion)
+    obstacles = build_obstacles(run.scene, stored, Motion)
     for resumption in reversed(run.summary.get("resumed", [])):
         earlier, until = resumption.get("earlier_motions", {}), resumption.get("time", 0.0)
-        found = [
-            _with_earlier_motion(run, each, earlier[each.name], until) if each.name in earlier else each
-            for each in found
+        obstacles = [
+            _with_earlier_motion(run, body, earlier[body.name], until) if body.name in earlier else body
+            for body in obstacles
         ]
-    return found
+    return obstacles
 
 
 def _with_earlier_motion(

@@ -73,9 +73,9 @@ def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: I
         Positions in some states [m], used if the scene gives no direction.
     triangles : (F, 3)
     """
-    given = _scene_camera(scene).line_of_sight
-    if given is not None:
-        return _unit(np.array(given))
+    chosen = _scene_camera(scene).line_of_sight
+    if chosen is not None:
+        return _unit(np.array(chosen))
     azimuths = 2.0 * math.pi * np.arange(AZIMUTHS) / AZIMUTHS
     corners = [x[triangles] for x in shapes]
     normals = [np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]) for c in corners]

@@ -44,10 +44,10 @@ class ColourRange:
         ------
         InputError
         """
-        given = [word.strip() for word in text.split(",")]
-        percent = all(word.endswith("%") for word in given)
+        words = [word.strip() for word in text.split(",")]
+        percent = all(word.endswith("%") for word in words)
         try:
-            ends = [float(word.removesuffix("%") if percent else word) for word in given]
+            ends = [float(word.removesuffix("%") if percent else word) for word in words]
         except ValueError:
             ends = []
         if len(ends) != 2 or not -np.inf < ends[0] < ends[1] < np.inf:

@@ -160,7 +160,7 @@ class SceneDrawing:
         key_light = self._add_lights(view)
         self._sheet_actors: list[Any] = []
         self.colour_by(quantity, limits)
-        self._obstacles = [(each, self._add_obstacle(each)) for each in obstacles]
+        self._obstacles = [(obstacle, self._add_obstacle(obstacle)) for obstacle in obstacles]
         self._ground = None
         has_floor = plan.options.ground and not any(obstacle.infinite for obstacle in obstacles)
         if has_floor and plan.scene.gravity is not None:

@@ -139,8 +139,8 @@ class RunPage:
     @property
     def _frame(self) -> int:
         """Number of the state; a page may send any value."""
-        given = self._state.frame
-        return min(max(int(given), 0), self._state.last) if isinstance(given, int) else 0
+        frame = self._state.frame
+        return min(max(int(frame), 0), self._state.last) if isinstance(frame, int) else 0
 
     def _colour(self, **_: Any) -> None:
         """Colour the sheets by the field that the page has, in a range fitted to the states so far."""

@@ -108,8 +108,8 @@ class Access:
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
         if not self._is_this_machine(host):
             return "this server does not go by that name"
-        given = request.query.get("token") or request.cookies.get(self._cookie) or ""
-        if not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token):
+        token = request.query.get("token") or request.cookies.get(self._cookie) or ""
+        if not hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token):
             return "the address needs the token that was printed at the start"
         if origin is not None and origin.partition("://")[2] != host:
             return "a page from elsewhere may not ask"
@@ -145,8 +145,8 @@ def check_address(host: str, port: int) -> None:
         For a port in use, a host that is not this machine, and similar errors.
     """
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, address = found[0][0], found[0][4]
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, address = addresses[0][0], addresses[0][4]
         socket.create_server(address, family=family).close()
     except (OSError, OverflowError, UnicodeError) as error:
         raise _refusal(host, port, error) from None
