@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import platform
 import sys
@@ -11,6 +10,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
@@ -45,8 +45,8 @@ def write_summary(path: str | os.PathLike[str], content: Mapping[str, Any], comm
     """
 
     def work() -> None:
-        text = json.dumps(_to_json(content), indent=2, ensure_ascii=False, allow_nan=False)
-        replace_text(path, text + "\n")
+        plain = to_jsonable_python(dict(content), inf_nan_mode="null", fallback=lambda array: array.tolist())
+        replace_text(path, json.dumps(plain, indent=2, ensure_ascii=False) + "\n")
 
     on_root(comm, work)
 
@@ -104,20 +104,3 @@ def library_versions() -> dict[str, str]:
     if "numba" in sys.modules:
         versions["numba"] = sys.modules["numba"].__version__
     return versions
-
-
-def _to_json(value: Any) -> Any:
-    """The value converted to types that JSON supports."""
-    if isinstance(value, Mapping):
-        return {str(key): _to_json(entry) for key, entry in value.items()}
-    if isinstance(value, np.ndarray):
-        return _to_json(value.tolist())
-    if isinstance(value, list | tuple | set | frozenset):
-        return [_to_json(entry) for entry in value]
-    if isinstance(value, np.generic):
-        return _to_json(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    return value
