@@ -24,9 +24,6 @@ from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.handles.motion import Motion
 
-MAX_LISTED_CHANGES = 12
-"""Maximum number of a resumed scene's changes that are listed one by one."""
-
 
 def used_groups(scene: Scene) -> set[str]:
     """Names of the mesh's groups that a scene uses."""
@@ -145,15 +142,10 @@ def note_changes(simulation: SteppedScene, before: Path) -> tuple[list[Change], 
             earlier = on_root(comm, lambda: obstacle_motions(load_scene(before, meshes_needed=False)))
             now = obstacle_motions(scene)
             earlier_motions = {n: motion for n, motion in earlier.items() if n in now and motion != now[n]}
-    for change in changes[:MAX_LISTED_CHANGES]:
+    for change in changes:
         if change.key == "time.end":
             notes.append(str(change))
-        elif change.key == "time.integrator":
-            notes.append(
-                f"changed since the run was begun: {change} (begins without memory of earlier steps)"
-            )
-        else:
-            notes.append(f"changed since the run was begun: {change}")
-    if len(changes) > MAX_LISTED_CHANGES:
-        notes.append(f"and {len(changes) - MAX_LISTED_CHANGES} more changes, listed in summary.json")
+            continue
+        restart = " (begins without memory of earlier steps)" if change.key == "time.integrator" else ""
+        notes.append(f"changed since the run was begun: {change}{restart}")
     return changes, earlier_motions
