@@ -101,7 +101,7 @@ class Writer:
         row = dict.fromkeys(HISTORY_COLUMNS, 0.5) | {"linear_iterations": 9, "rejected": 0}
         self.history.append(row | {"step": i, "time": 0.1 * i, "newton_iterations": 2})
         fields = {"velocity": ("vertex", velocity(i)), "stress": ("triangle", tensor(i))}
-        self.states.write(i, 0.1 * i, position(i), fields if self.fields else {})
+        self.states.write(i, 0.1 * i, position(i), fields if self.fields else {})()
 
 
 def written(folder: Path, states: int = 3, vt: str = "each vertex", fields: bool = True) -> Path:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -17,10 +17,11 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.file_operations import writing
-from lyra_petsc.output.hdf5 import Empty, create_file, read_slab, write_rows
+from lyra_petsc.output.file_operations import sync, writing
+from lyra_petsc.output.hdf5 import read_slab, write_rows
+from lyra_petsc.output.layout import CHECKPOINT, PREVIOUS
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_files
+from lyra_petsc.output.run_folder import RUN
 from lyra_petsc.output.stored import check_sums, open_stored
 from lyra_petsc.parallel import on_root
 
@@ -29,9 +30,6 @@ LARGEST = 1e50
 
 ENTRIES = "entries"
 """Dataset of bytes: the SHA-256 of a JSON text, and the text with all numbers and check sums."""
-
-PADDING = 1 << 12
-"""The length of the text is a multiple of this, so that a file can be used again [bytes]."""
 
 Scalars = dict[str, Any]
 
@@ -45,7 +43,7 @@ class Checkpoint:
     arrays : dict of str to array
         Vertex arrays (n_owned, 3) by name, in this rank's numbering.
     scalars : dict
-        As given to `CheckpointWriter.write`.
+        As passed to `write_checkpoint`.
     file : Path
         The file that was read: the newest undamaged checkpoint.
     note : str or None
@@ -64,8 +62,16 @@ class Checkpoint:
     elements: dict[str, NDArray[Any]] = field(default_factory=dict)
 
 
-class CheckpointWriter:
-    """Writes checkpoints; the one before is kept as the previous one. All methods are collective.
+def write_checkpoint(
+    folder: Path,
+    order: FileOrder,
+    arrays: Mapping[str, NDArray[Any]],
+    scalars: Mapping[str, Any],
+    edge_order: FileOrder | None = None,
+    edge_arrays: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    elements: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+) -> Callable[[], None]:
+    """Write a checkpoint beside those that exist; collective.
 
     Parameters
     ----------
@@ -73,77 +79,52 @@ class CheckpointWriter:
         The run's folder.
     order : FileOrder
         File order of the vertices that each rank owns.
+    arrays : mapping of str to (n_owned, 3) array of float64
+        Vertex arrays: ``position`` [m], ``velocity`` [m/s], and arrays of the integrator's history.
+    scalars : mapping
+        Numbers, texts, and lists and mappings of these; the same on every rank.
     edge_order : FileOrder or None
         File order of the edges with an unknown that each rank owns; None without such edges.
+    edge_arrays : mapping of str to (n_edges,) array of float64
+        Arrays of the unknowns of edges.
+    elements : mapping of str to (n, m) array of float64
+        Rows of this rank's changing elements, in any order.
+
+    Returns
+    -------
+    callable
+        To be called on rank 0, also in another thread: when the file is on disk, it becomes the newest
+        checkpoint, and the newest one so far the previous one.
+
+    Raises
+    ------
+    OutputError
+        On every rank, if the file cannot be written; then the checkpoints are kept.
     """
+    slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
+    if edge_order is not None:
+        slabs |= {f"edges/{name}": edge_order.to_slab(np.asarray(v)) for name, v in edge_arrays.items()}
+    slabs |= {f"elements/{name}": rows for name, rows in elements.items()}
+    sums = dict(zip(slabs, check_sums(slabs.values(), order.comm).tolist(), strict=True))
+    entries = _encoded({"n_vertices": order.n_global, "sums": sums, "scalars": dict(scalars)})
+    slabs[ENTRIES] = np.frombuffer(entries if order.comm.rank == 0 else b"", np.uint8)
+    newest, previous = folder / CHECKPOINT, folder / PREVIOUS
+    part = newest.with_name(f"{CHECKPOINT}.part")
+    write_rows(part, slabs, order.comm, create={})
 
-    def __init__(self, folder: Path, order: FileOrder, edge_order: FileOrder | None = None) -> None:
-        self._folder, self._order, self._edge_order = folder, order, edge_order
-        # datasets of the newest file and of the one before, if this run has written them (rank 0)
-        self._layouts: tuple[dict[str, Empty], ...] = ({}, {})
+    def publish() -> None:
+        sync(part)
+        with writing(newest):
+            if newest.exists():
+                os.replace(newest, previous)
+            os.replace(part, newest)
 
-    def write(
-        self,
-        arrays: Mapping[str, NDArray[Any]],
-        scalars: Mapping[str, Any],
-        edge_arrays: Mapping[str, NDArray[Any]] = MappingProxyType({}),
-        elements: Mapping[str, NDArray[Any]] = MappingProxyType({}),
-    ) -> None:
-        """Write a checkpoint.
-
-        Parameters
-        ----------
-        arrays : mapping of str to (n_owned, 3) array of float64
-            Vertex arrays: ``position`` [m], ``velocity`` [m/s], and arrays of the integrator's history.
-        scalars : mapping
-            Numbers, texts, and lists and mappings of these; the same on every rank.
-        edge_arrays : mapping of str to (n_edges,) array of float64
-            Arrays of the unknowns of edges.
-        elements : mapping of str to (n, m) array of float64
-            Rows of this rank's changing elements, in any order.
-
-        Raises
-        ------
-        OutputError
-            On every rank, if the file cannot be written; then the newest checkpoint is kept.
-        """
-        order = self._order
-        slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
-        if self._edge_order is not None:
-            slabs |= {f"edges/{n}": self._edge_order.to_slab(np.asarray(v)) for n, v in edge_arrays.items()}
-        slabs |= {f"elements/{name}": rows for name, rows in elements.items()}
-        sums = dict(zip(slabs, check_sums(slabs.values(), order.comm).tolist(), strict=True))
-        entries = _encoded({"n_vertices": order.n_global, "sums": sums, "scalars": dict(scalars)})
-        slabs[ENTRIES] = np.frombuffer(entries if order.comm.rank == 0 else b"", np.uint8)
-        part = self._folder / f"{NEXT}.part"
-        newest, previous = (self._folder / name for name in (CHECKPOINT, PREVIOUS))
-
-        def prepare(lengths: Sequence[int]) -> None:
-            layout = {
-                name: Empty((n, *rows.shape[1:]), rows.dtype)
-                for n, (name, rows) in zip(lengths, slabs.items(), strict=True)
-            }
-            if layout == self._layouts[1] and previous.exists():
-                with writing(part):
-                    os.replace(previous, part)
-            else:
-                create_file(part, layout)
-            self._layouts = layout, self._layouts[0]
-
-        def publish() -> None:
-            with writing(newest):
-                os.replace(part, newest.with_name(NEXT))
-                if newest.exists():
-                    os.replace(newest, previous)
-                os.replace(newest.with_name(NEXT), newest)
-
-        write_rows(part, slabs, order.comm, prepare, publish)
+    return publish
 
 
 def _encoded(entries: Mapping[str, Any]) -> bytes:
-    """A check sum and the entries as text, padded so that its length seldom changes."""
+    """A check sum and the entries as text."""
     text = json.dumps(entries).encode()
-    text += b" " * (-len(text) % PADDING)
     return hashlib.sha256(text).hexdigest().encode() + text
 
 
@@ -202,7 +183,7 @@ def read_checkpoint(
         On every rank, if there is no checkpoint, none holds what a run writes, or the mesh is another one.
     """
     newest: InputError | None = None
-    for file in on_root(order.comm, lambda: checkpoint_files(folder)):
+    for file in on_root(order.comm, lambda: RUN.resumable(Path(folder))):
         try:
             scalars, stored = on_root(
                 order.comm,

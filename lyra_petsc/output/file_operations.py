@@ -146,6 +146,18 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
             raise
 
 
+def sync(path: Path) -> None:
+    """Write a file from the memory of the operating system to disk.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    with writing(path), open(path, "rb") as file:
+        os.fsync(file.fileno())
+
+
 def raise_on_all_ranks(comm: MPI.Comm, problem: LyraError | None) -> None:
     """Raise on every rank the error of the lowest rank that has one. Collective.
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -36,7 +36,7 @@ MAX_OVERHEAD = 1 << 16
 DATASET_OVERHEAD = 1 << 10
 
 BLOCK = 1 << 22
-"""Number of bytes that rank 0 receives and writes at a time."""
+"""Number of bytes that rank 0 gathers and writes at a time."""
 
 
 class Empty(NamedTuple):
@@ -46,34 +46,81 @@ class Empty(NamedTuple):
     dtype: np.dtype[Any]
 
 
-def create_file(
-    path: Path, content: Mapping[str, NDArray[Any] | Empty], attributes: Attributes = MappingProxyType({})
-) -> None:
-    """Create a file, or replace it atomically. Call on one rank.
+@contextmanager
+def new_file(
+    path: Path, content: Mapping[str, NDArray[Any] | Empty], attributes: Attributes
+) -> Iterator[Any]:
+    """A context with a new file open, of full size, that replaces ``path`` at its end. Call on one rank.
 
     Raises
     ------
     OutputError
-        If the file cannot be written; then an existing file is kept.
+        If the file cannot be written, also within the context; then an existing file is kept.
     """
-    part = path.with_name(path.name + ".part")
+    h5py, part = import_h5py(), path.with_name(path.name + ".part")
+    data = sum(math.prod(rows.shape) * rows.dtype.itemsize for rows in content.values())
+    texts = sum(len(str(value).encode()) for values in attributes.values() for value in values.values())
+    early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    early.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    with_groups = h5py.h5p.create(h5py.h5p.LINK_CREATE)
+    with_groups.set_create_intermediate_group(True)
     with writing(path, HDF5_ERRORS):
         try:
-            _create(part, content, attributes)
+            with open_output(part) as raw:
+                size = data + texts + MAX_OVERHEAD + DATASET_OVERHEAD * len(content)
+                os.posix_fallocate(raw.fileno(), 0, size)
+            # older formats of groups and headers have no check sums, and HDF5 crashes if they are damaged
+            with h5py.File(part, "w", libver=("v108", "v108")) as file:
+                for name, rows in content.items():
+                    kind, space = h5py.h5t.py_create(rows.dtype), h5py.h5s.create_simple(rows.shape)
+                    h5py.h5d.create(file.id, name.encode(), kind, space, early, with_groups)
+                    if isinstance(rows, np.ndarray):
+                        put_rows(file, name, 0, np.ascontiguousarray(rows))
+                for name, values in attributes.items():
+                    owner = file[name] if name in file else file.create_group(name)
+                    for key, value in values.items():
+                        # fixed-length text: HDF5 stores text of variable length in a heap without check sums
+                        text = value.encode() if isinstance(value, str) else b""
+                        kind = (
+                            h5py.string_dtype("utf-8", max(1, len(text))) if isinstance(value, str) else None
+                        )
+                        owner.attrs.create(key, text if kind else value, dtype=kind)
+                file.flush()
+                with open_output(part, "r+b") as raw:
+                    os.posix_fallocate(raw.fileno(), 0, file.id.get_filesize())
+                yield file
             os.replace(part, path)
         except BaseException:
             part.unlink(missing_ok=True)
             raise
 
 
-def write_rows(
-    path: Path,
-    slabs: Mapping[str, NDArray[Any]],
-    comm: MPI.Comm,
-    prepare: Callable[[Sequence[int]], None] = lambda lengths: None,
-    publish: Callable[[], None] = lambda: None,
+def put_rows(file: Any, name: str, start: int, rows: NDArray[Any]) -> None:
+    """Write consecutive rows, from number ``start`` on, to a dataset of an open file.
+
+    By h5py's low-level interface, as is the creation of datasets: the other one takes half as long again for
+    a small state with its checkpoint.
+    """
+    h5py = import_h5py()
+    dataset = h5py.h5d.open(file.id, name.encode())
+    space = dataset.get_space()
+    space.select_hyperslab((start, *(0 for _ in rows.shape[1:])), rows.shape)
+    dataset.write(h5py.h5s.create_simple(rows.shape), space, rows)
+
+
+def create_file(
+    path: Path, content: Mapping[str, NDArray[Any] | Empty], attributes: Attributes = MappingProxyType({})
 ) -> None:
-    """Write distributed arrays to datasets of an existing file.
+    """Create a file as by `new_file`."""
+    with new_file(path, content, attributes):
+        pass
+
+
+def write_rows(
+    path: Path, slabs: Mapping[str, NDArray[Any]], comm: MPI.Comm, create: Attributes | None = None
+) -> None:
+    """Write distributed arrays to datasets of a file, which `file_operations.sync` brings to disk.
 
     The ranks of several machines write at the same time, if h5py is built with MPI. Otherwise rank 0 writes
     all rows, which it receives in blocks; on one machine this is the faster way.
@@ -86,10 +133,8 @@ def write_rows(
         are the same on every rank; a rank may have no rows.
     comm : MPI.Comm
         All ranks; collective.
-    prepare : callable
-        Called on rank 0 with the number of rows of each dataset, before any is written.
-    publish : callable
-        Called on rank 0 after all rows are written.
+    create : mapping, optional
+        Create the file for these arrays first, with these attributes; otherwise it exists, with its datasets.
 
     Raises
     ------
@@ -98,34 +143,56 @@ def write_rows(
     """
     slabs = {name: np.ascontiguousarray(rows) for name, rows in slabs.items()}
     lengths = np.array(comm.allgather([len(rows) for rows in slabs.values()])).reshape(comm.size, len(slabs))
-    in_parallel = import_h5py().get_config().mpi and not on_one_machine(comm)
+    starts = np.concatenate([np.zeros((1, len(slabs)), int), lengths.cumsum(axis=0)])
+    totals = zip(slabs.items(), starts[-1].tolist(), strict=True)
+    empty = {name: Empty((n, *rows.shape[1:]), rows.dtype) for (name, rows), n in totals}
 
-    def write(blocks: Iterable[tuple[str, int, NDArray[Any]]]) -> None:
-        with rows_writable(path, **({"driver": "mpio", "comm": comm} if in_parallel else {})) as file:
+    def write(opened: AbstractContextManager[Any], blocks: Iterable[tuple[str, int, NDArray[Any]]]) -> None:
+        with opened as file:
             for name, start, rows in blocks:
-                file[name][start : start + len(rows)] = rows
+                put_rows(file, name, start, rows)
 
-    if in_parallel:
-        on_root(comm, lambda: prepare(lengths.sum(axis=0).tolist()))
-        starts = lengths[: comm.rank].sum(axis=0).tolist()
-        on_every_rank(comm, lambda: write(zip(slabs, starts, slabs.values(), strict=True)))
-        on_root(comm, publish)
+    if import_h5py().get_config().mpi and not on_one_machine(comm):
+        if create is not None:
+            on_root(comm, lambda: create_file(path, empty, create))
+        mine = zip(slabs, starts[comm.rank].tolist(), slabs.values(), strict=True)
+        on_every_rank(comm, lambda: write(rows_writable(path, driver="mpio", comm=comm), mine))
         return
-    for rows in slabs.values() if comm.rank else ():
-        for block in _blocks(rows):
-            comm.Send(block, 0)
+    blocks = _gathered_blocks(slabs, starts, comm)
 
     def receive_and_write() -> None:
-        arriving = _arriving_blocks(slabs, lengths, comm)
         try:
-            prepare(lengths.sum(axis=0).tolist())
-            write(arriving)
+            write(rows_writable(path) if create is None else new_file(path, empty, create), blocks)
         finally:
-            for _ in arriving:  # other ranks wait until their rows are received
+            for _ in blocks:  # other ranks wait until their rows are received
                 pass
-        publish()
 
+    for _ in blocks if comm.rank else ():  # sends this rank's rows
+        pass
     on_root(comm, receive_and_write)
+
+
+def _gathered_blocks(
+    slabs: Mapping[str, NDArray[Any]], starts: NDArray[np.int64], comm: MPI.Comm
+) -> Iterator[tuple[str, int, NDArray[Any]]]:
+    """Dataset, first row and rows of each block of all ranks' rows on rank 0; other ranks send theirs."""
+    for (name, own), bounds in zip(slabs.items(), starts.T.tolist(), strict=True):
+        size = max(1, BLOCK // (own.itemsize * math.prod(own.shape[1:])))
+        for first in range(0, bounds[-1], size):
+            last = min(first + size, bounds[-1])
+            parts = [min(max(bound, first), last) for bound in bounds]  # where each rank's part begins
+            if comm.rank:
+                begin, end = (row - bounds[comm.rank] for row in parts[comm.rank : comm.rank + 2])
+                if begin < end:
+                    comm.Send(own[begin:end], 0)
+                continue
+            block = own[first:last]
+            if missing := last - first - len(block):
+                block = np.concatenate([block, np.empty((missing, *own.shape[1:]), own.dtype)])
+            for rank in range(1, comm.size):
+                if parts[rank] < parts[rank + 1]:
+                    comm.Recv(block[parts[rank] - first : parts[rank + 1] - first], rank)
+            yield name, first, block
 
 
 @contextmanager
@@ -141,28 +208,6 @@ def rows_writable(path: Path, **how: Any) -> Iterator[Any]:
         open_output(path, "r+b").close()  # HDF5 would follow a link
         with import_h5py().File(path, "r+", **how) as file:
             yield file
-
-
-def _arriving_blocks(
-    slabs: Mapping[str, NDArray[Any]], lengths: NDArray[Any], comm: MPI.Comm
-) -> Iterator[tuple[str, int, NDArray[Any]]]:
-    """Dataset, first row and rows of each block of all ranks' rows (rank 0)."""
-    for (name, own), counts in zip(slabs.items(), lengths.T.tolist(), strict=True):
-        start = 0
-        for rank, count in enumerate(counts):
-            rows = own if rank == 0 else np.broadcast_to(own.dtype.type(0), (count, *own.shape[1:]))
-            for block in _blocks(rows):
-                if rank:
-                    block = np.empty(block.shape, own.dtype)
-                    comm.Recv(block, rank)
-                yield name, start, block
-                start += len(block)
-
-
-def _blocks(rows: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    """Consecutive rows of at most `BLOCK` bytes."""
-    size = max(1, BLOCK // (rows.itemsize * math.prod(rows.shape[1:])))
-    return (rows[i : i + size] for i in range(0, len(rows), size))
 
 
 def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> NDArray[Any]:
@@ -192,43 +237,7 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
             stored = file[dataset]
             if stored.shape[:1] != (order.n_global,):
                 rows = stored.shape[0] if stored.shape else "no"
-                raise InputError(
-                    f"{dataset} has {rows} rows, {order.n_global} are expected", file=path
-                )
+                raise InputError(f"{dataset} has {rows} rows, {order.n_global} are expected", file=path)
             return np.asarray(stored[order.start : order.start + order.n_slab])
 
     return on_every_rank(order.comm, work)
-
-
-def _create(path: Path, content: Mapping[str, NDArray[Any] | Empty], attributes: Attributes) -> None:
-    """Create a file of full size.
-
-    Raises
-    ------
-    One of `HDF5_ERRORS`
-        If the file cannot be created.
-    """
-    h5py = import_h5py()
-    data = sum(math.prod(rows.shape) * rows.dtype.itemsize for rows in content.values())
-    texts = sum(len(str(value).encode()) for values in attributes.values() for value in values.values())
-    early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-    early.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    with open_output(path) as raw:
-        os.posix_fallocate(raw.fileno(), 0, data + texts + MAX_OVERHEAD + DATASET_OVERHEAD * len(content))
-    # older formats of groups and headers have no check sums, and HDF5 crashes if they are damaged
-    with h5py.File(path, "w", libver=("v108", "v108")) as file:
-        owners = {"/": file}
-        for name, rows in content.items():
-            owners[name] = file.create_dataset(name, rows.shape, rows.dtype, dcpl=early)
-            if isinstance(rows, np.ndarray):
-                owners[name][...] = rows
-        for name, values in attributes.items():
-            owner = owners[name] if name in owners else file.require_group(name)
-            for key, value in values.items():
-                # fixed-length text: HDF5 stores text of variable length in a heap without check sums
-                text = value.encode() if isinstance(value, str) else b""
-                kind = h5py.string_dtype("utf-8", max(1, len(text))) if isinstance(value, str) else None
-                owner.attrs.create(key, text if kind else value, dtype=kind)
-    with open_output(path, "r+b") as raw:
-        os.posix_fallocate(raw.fileno(), 0, os.fstat(raw.fileno()).st_size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, Mesh
 from lyra_petsc.output.hdf5 import create_file
+from lyra_petsc.output.layout import MESH_FILE
 from lyra_petsc.output.stored import SUM, StoredMesh, check_sum
-from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.parallel import on_root
 
 ROUNDING = 1e-9
@@ -144,35 +145,30 @@ def _difference(stored: StoredMesh, mesh: Mesh, used: set[str]) -> str:
     if counts != (mesh.n_vertices, mesh.n_triangles):
         now = f"{mesh.n_vertices} vertices and {mesh.n_triangles} triangles"
         return f"it has {now}, not {counts[0]} and {counts[1]}"
-    rows = np.flatnonzero((stored.triangles != mesh.triangles).any(axis=1))
-    if len(rows):
-        return f"triangle {rows[0]} has other vertices ({len(rows)} such triangles)"
-    tolerance = ROUNDING * float(np.abs(mesh.rest).max(initial=0.0) + np.abs(mesh.positions).max(initial=0.0))
-    shapes = ((stored.rest, mesh.rest, "at rest"), (stored.start, mesh.positions, "at the start"))
-    for before, after, shape in shapes:
-        if row := _largest_difference(before, after, tolerance):
-            return f"vertex {row[0]} stands {row[1]:.3g} m off {shape}"
-    one_uv, corner_uv = vertex_uv(mesh) is not None, mesh.triangle_uv
-    if one_uv != (stored.uv is not None) or _largest_difference(stored.corner_uv, corner_uv, tolerance):
-        return "other material coordinates"
+    size = _extent(mesh.rest) + _extent(mesh.positions)
+    agreement = {
+        "other triangles": np.array_equal(stored.triangles, mesh.triangles),
+        "another shape at rest": _agree(stored.rest, mesh.rest, size),
+        "another shape at the start": _agree(stored.start, mesh.positions, size),
+        "other material coordinates": _agree(stored.corner_uv, mesh.triangle_uv, size),
+    }
     for name, group in stored.groups.items():
         if name in used and name in mesh.groups:
             pairs = zip(_group_arrays(group).values(), _group_arrays(mesh.groups[name]).values(), strict=True)
-            if not all(np.array_equal(before, after) for before, after in pairs):
-                return f"group {name!r} has other members"
+            agreement[f"group {name!r} has other members"] = all(starmap(np.array_equal, pairs))
     obstacles = stored.obstacles if mesh.obstacles else {}
     for name, surface in mesh.obstacles.items():
-        if name not in obstacles:
-            return f"obstacle {name!r} is new"
-        tolerance = ROUNDING * float(np.abs(surface.points).max())
-        same = np.array_equal(obstacles[name].triangles, surface.triangles)
-        if not same or _largest_difference(obstacles[name].points, surface.points, tolerance):
-            return f"obstacle {name!r} is another mesh"
-    return ""
+        agreement[f"obstacle {name!r} is another mesh"] = (
+            name in obstacles
+            and np.array_equal(obstacles[name].triangles, surface.triangles)
+            and _agree(obstacles[name].points, surface.points, _extent(surface.points))
+        )
+    return next((difference for difference, agrees in agreement.items() if not agrees), "")
 
 
-def _largest_difference(before: Array, after: Array, tolerance: float) -> tuple[int, float] | None:
-    """The row that differs most and its difference [m], or None if it is at most ``tolerance``."""
-    distance = np.abs(before - after).reshape(len(after), -1).max(axis=1)
-    row = int(np.argmax(distance))
-    return (row, float(distance[row])) if distance[row] > tolerance else None
+def _extent(points: Array) -> float:
+    return float(np.abs(points).max(initial=0.0))
+
+
+def _agree(before: Array, after: Array, size: float) -> bool:
+    return before.shape == after.shape and np.allclose(before, after, rtol=0.0, atol=ROUNDING * size)

@@ -17,18 +17,21 @@ from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.extras import require_packages
 from lyra_petsc.output.file_operations import possible_path, reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
-from lyra_petsc.output.run_folder import LOCK_FILE
-from lyra_petsc.output.stored import (
-    StoredMesh,
-    check_file,
-    check_folder,
-    read_stored,
-    state_files,
-    states_of,
+from lyra_petsc.output.layout import (
+    HISTORY,
+    LOCK_FILE,
+    MESH_FILE,
+    OBSTACLES,
+    PROBES,
+    REACTIONS,
+    SCENE_FILE,
+    SUMMARY_FILE,
 )
+from lyra_petsc.output.run_folder import is_locked
+from lyra_petsc.output.stored import StoredMesh, check_file, check_folder, read_stored, states_in
 from lyra_petsc.output.summary import read_summary
 from lyra_petsc.output.tensors import COMPONENTS, is_tensor
-from lyra_petsc.output.xdmf import MESH_FILE, WrittenState, group_name
+from lyra_petsc.output.xdmf import WrittenState, group_name
 from lyra_petsc.terms import energies
 
 if TYPE_CHECKING:
@@ -74,7 +77,9 @@ class StoredRun:
         self.times: Array = np.array([state.time for state in self._states])
         # a run that was resumed with other fields has them in some states only
         of_states = [{field.name: field for field in state.fields} for state in self._states]
-        self._fields = {n: field for n, field in of_states[0].items() if all(n in state for state in of_states)}
+        self._fields = {
+            n: field for n, field in of_states[0].items() if all(n in state for state in of_states)
+        }
         self.fields = tuple(self._fields)
 
     def refresh(self) -> bool:
@@ -237,17 +242,17 @@ class StoredRun:
     @property
     def reactions(self) -> Any:
         """reactions.csv [N]; empty if the scene does not ask for it."""
-        return as_frame(self._table("reactions.csv"))
+        return as_frame(self._table(REACTIONS))
 
     @property
     def probes(self) -> Any:
         """probes.csv [m]; empty if the scene has no probes."""
-        return as_frame(self._table("probes.csv"))
+        return as_frame(self._table(PROBES))
 
     @property
     def obstacles(self) -> Any:
         """obstacles.csv, a row for each obstacle and step [N], [N·m]; empty if the scene has no obstacles."""
-        return as_frame(self._table("obstacles.csv"))
+        return as_frame(self._table(OBSTACLES))
 
     @cached_property
     def _history(self) -> Columns:
@@ -264,17 +269,23 @@ class StoredRun:
         """The scene from scene.yaml; its mesh files are not needed."""
         from lyra_petsc.scene.load import load_scene
 
-        return load_scene(self.folder / "scene.yaml", meshes_needed=False)
+        return load_scene(self.folder / SCENE_FILE, meshes_needed=False)
 
     @cached_property
     def summary(self) -> dict[str, Any]:
         """summary.json; empty if the file is missing."""
-        return read_summary(self.folder / "summary.json")
+        return read_summary(self.folder / SUMMARY_FILE)
+
+    @property
+    def outcome(self) -> str:
+        """``done``, ``running``, ``killed``, ``unknown``, or the message with which the run stopped."""
+        outcome = str(self.summary.get("outcome", "unknown"))
+        return "killed" if outcome == "running" and not is_locked(self.folder) else outcome
 
     @property
     def finished(self) -> bool:
         """Whether the run was completed."""
-        return bool(self.summary.get("outcome") == "done")
+        return self.outcome == "done"
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -300,7 +311,7 @@ def stored_states(folder: Path) -> list[WrittenState]:
     if not folder.is_dir():
         raise InputError("is a file; give the folder of a run, as in runs/flag", file=folder)
     try:
-        states = [state for path in state_files(folder) for state in states_of(path)]
+        states = states_in(folder)
         begun = bool(states) or any((folder / name).exists() for name in (MESH_FILE, LOCK_FILE))
     except OSError as error:
         raise InputError(f"cannot be read: {reason(error)}", file=folder) from None
@@ -367,7 +378,7 @@ class StateArrays(Sequence[NDArray[Any]]):
 
 def read_history(folder: Path) -> Columns:
     """The columns of history.csv; raises as `read_table`."""
-    return read_table(folder / "history.csv", HISTORY_COLUMNS)
+    return read_table(folder / HISTORY, HISTORY_COLUMNS)
 
 
 def read_table(path: Path, needed: Sequence[str] = ("step", "time")) -> Columns:

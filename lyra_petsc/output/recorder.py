@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import time as clock
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lyra_petsc.output.checkpoint import CheckpointWriter, read_checkpoint
+from lyra_petsc.output.checkpoint import read_checkpoint, write_checkpoint
 from lyra_petsc.output.continuation import first_positions, note_changes, restore, term_arrays, used_groups
 from lyra_petsc.output.fields import Field, chosen_fields
-from lyra_petsc.output.file_operations import replace_text, writing
+from lyra_petsc.output.file_operations import replace_text
+from lyra_petsc.output.layout import SCENE_FILE
 from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.run_folder import CHECKPOINT
 from lyra_petsc.output.run_tables import RunTables
 from lyra_petsc.output.states import FailureState, StateWriter, remove_failure, write_failure
 from lyra_petsc.parallel import on_root
@@ -69,7 +69,7 @@ class Recorder:
         self._comm = points.comm
         self._tables = RunTables(simulation)
         self._disk = ThreadPoolExecutor(max_workers=1)
-        self._synced: Future[None] | None = None  # of rank 0
+        self._completion: Future[None] | None = None  # of rank 0
         self._last_checkpoint = clock.monotonic()
         self._steps_since_checkpoint = 0
         self._last_state = -1
@@ -85,7 +85,7 @@ class Recorder:
         problem = simulation.problem
         scene = problem.scene
         write_mesh(folder, problem.mesh, problem.points.comm)
-        on_root(problem.points.comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
+        on_root(problem.points.comm, lambda: replace_text(folder / SCENE_FILE, dump_scene(scene)))
         self._open(folder, None)
         self._write_row(StepReport(0, 0.0, 0.0, 0, 0, 0, 0.0, 0.0))
         self.write_state()
@@ -107,11 +107,11 @@ class Recorder:
         on_root(self._comm, lambda: self._tables.check(folder))
         if checkpoint.note:
             simulation.notes.append(checkpoint.note)
-        self.changes, self.earlier_motions = note_changes(simulation, folder / "scene.yaml")
+        self.changes, self.earlier_motions = note_changes(simulation, folder / SCENE_FILE)
         if problem.start is not None:
             problem.start = first_positions(folder, self._vertices, otherwise=problem.start)
         self._open(folder, simulation.step_number)
-        on_root(self._comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
+        on_root(self._comm, lambda: replace_text(folder / SCENE_FILE, dump_scene(scene)))
         self._last_state = checkpoint.scalars["last_state"]
 
     def _open(self, folder: Path, resume_after: int | None) -> None:
@@ -126,7 +126,6 @@ class Recorder:
             vtkhdf=self._simulation.scene.output.vtkhdf,
             time_unit="1" if self._simulation.scene.time.static else "s",
         )
-        self._checkpoints = CheckpointWriter(folder, self._vertices, self._edges)
         self._tables.open(folder, resume_after)
 
     # -- a step --------------------------------------------------------------------------------------
@@ -166,24 +165,35 @@ class Recorder:
     # -- states --------------------------------------------------------------------------------------
 
     def write_state(self) -> None:
-        """Write and announce the present state, unless it is written already, and its checkpoint."""
+        """Write the present state, unless it is written already, and its checkpoint."""
         simulation = self._simulation
         if simulation.step_number == self._last_state:
             self.write_checkpoint()
             return
         problem = simulation.problem
         began = clock.monotonic()
-        self._states.write(
+        self._wait_for_disk()
+        announce = self._states.write(
             simulation.step_number,
             simulation.time,
             problem.equations.x[: problem.points.n_vertices],
             {field.name: (field.on, field.compute(problem)) for field in self._fields},
         )
         self._last_state = simulation.step_number
-        self.write_checkpoint(began)
+        self._write_checkpoint(began, announce)
 
-    def write_checkpoint(self, began: float | None = None) -> None:
-        """Write a checkpoint of the present state; its duration counts from ``began`` on, if given."""
+    def write_checkpoint(self) -> None:
+        """Write a checkpoint of the present state."""
+        began = clock.monotonic()
+        self._wait_for_disk()
+        self._write_checkpoint(began)
+
+    def _write_checkpoint(self, began: float, *announce: Callable[[], None]) -> None:
+        """Write a checkpoint, whose duration counts from ``began`` on.
+
+        A thread of rank 0 completes it while the run goes on: it brings the state to disk, announces it by
+        ``announce``, and then does so with the checkpoint, which hence never follows a state that is lost.
+        """
         simulation = self._simulation
         equations, layout = simulation.problem.equations, simulation.problem.points
         n, (saved, scalars) = layout.n_owned, simulation.saved_state()
@@ -196,12 +206,17 @@ class Recorder:
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
         edges |= term_states.edge_arrays(stateful, layout)
         scalars["last_state"] = self._last_state
-        began = clock.monotonic() if began is None else began
         elements = term_states.element_arrays(stateful, layout)
-        self._wait_for_disk()  # the previous checkpoint is safe before this one takes its place
-        self._checkpoints.write(arrays, scalars, edges, elements)
+        publish = write_checkpoint(
+            self._folder, self._vertices, arrays, scalars, self._edges, edges, elements
+        )
+
+        def complete() -> None:
+            for work in (*announce, publish):
+                work()
+
         if self._comm.rank == 0:
-            self._synced = self._disk.submit(_sync, self._folder / CHECKPOINT)
+            self._completion = self._disk.submit(complete)
         self._last_checkpoint = clock.monotonic()
         self._steps_since_checkpoint = 0
         self._checkpoint_seconds = self._last_checkpoint - began
@@ -229,7 +244,7 @@ class Recorder:
         )
 
     def flush(self) -> None:
-        """Wait until the last checkpoint is on disk, and announce all states.
+        """Wait until the last state and checkpoint are on disk and announced.
 
         Raises
         ------
@@ -241,9 +256,9 @@ class Recorder:
 
     def _wait_for_disk(self) -> None:
         def work() -> None:
-            synced, self._synced = self._synced, None
-            if synced is not None:
-                synced.result()
+            completion, self._completion = self._completion, None
+            if completion is not None:
+                completion.result()
 
         on_root(self._comm, work)
 
@@ -251,9 +266,3 @@ class Recorder:
         """Close the tables; not collective."""
         self._disk.shutdown()
         self._tables.close()
-
-
-def _sync(path: Path) -> None:
-    """Write a file from the memory of the operating system to disk."""
-    with writing(path), open(path, "rb") as file:
-        os.fsync(file.fileno())

@@ -8,7 +8,6 @@ import re
 import shutil
 import socket
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.file_operations import open_regular_file, possible_path, reason
+from lyra_petsc.output.layout import CHECKPOINT, LOCK_FILE, PREVIOUS, RESULT
 from lyra_petsc.output.stored import OutsideFolderError, check_folder, open_stored
 from lyra_petsc.parallel import on_root
 
@@ -23,41 +23,6 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
 RUNS = Path("runs")
-LOCK_FILE = "run.lock"
-CHECKPOINT = "checkpoint.h5"
-PREVIOUS = "checkpoint-previous.h5"
-NEXT = "checkpoint-next.h5"
-
-# all files that a run writes, and no other names: --force removes these files only
-RESULT = re.compile(
-    r"(states-\d{4,}\.h5|(mesh|cells)\.h5|checkpoint(-previous|-next)?\.h5|states\.(xdmf|vtkhdf)"
-    r"|(history|probes|reactions|obstacles)\.csv|scene\.yaml|summary\.json|failure\.(h5|xdmf|txt))(\.part)?"
-)
-
-
-def checkpoint_files(folder: str | os.PathLike[str]) -> list[Path]:
-    """The checkpoints of a run that exist, newest first."""
-    # a kill between the two replacements of a write leaves the newest under NEXT
-    files = [Path(folder) / name for name in (NEXT, CHECKPOINT, PREVIOUS)]
-    return [file for file in files if file.is_file()]
-
-
-def existing_files(name: str, folder: Path) -> list[Path]:
-    """The file of this name in a folder as a list; empty if it does not exist."""
-    return [*folder.glob(name)]
-
-
-def _check_resumable(folder: Path) -> None:
-    """Refuse to resume if files of the run are links or checkpoints take data from other files."""
-    check_folder(folder)
-    for file in checkpoint_files(folder):
-        try:
-            with open_stored(file):
-                pass
-        except OutsideFolderError:
-            raise
-        except InputError:  # if one is damaged, the previous one is read
-            continue
 
 
 @dataclass(frozen=True)
@@ -67,31 +32,47 @@ class FolderKind:
     Attributes
     ----------
     noun : str
-        Name of the kind in messages, as in ``run``.
+        Name of the kind in messages, as in ``run``, and of the lock file, as in ``run.lock``.
     parent : Path
         Parent of folders that the user does not name.
-    lock : str
-        Name of the lock file.
     result : re.Pattern
         Names of the result files; ``--force`` removes no other file.
-    resumable : callable
-        Returns the files from which a folder can be resumed; empty if there are none.
+    resumed_from : tuple of str
+        Names of the files of which one at least must exist for a folder to be resumed.
     missing : str
-        Text for messages: the file that is missing if a folder cannot be resumed.
-    check : callable, optional
-        Further check of a folder to be resumed, which raises InputError.
+        Text for messages: what is missing if none exists.
     folders : tuple of str
         Names of subfolders that ``--force`` removes.
     """
 
     noun: str
     parent: Path
-    lock: str
     result: re.Pattern[str]
-    resumable: Callable[[Path], list[Path]]
+    resumed_from: tuple[str, ...]
     missing: str
-    check: Callable[[Path], None] | None = None
     folders: tuple[str, ...] = ()
+
+    @property
+    def lock(self) -> str:
+        """Name of the lock file."""
+        return f"{self.noun}.lock"
+
+    def resumable(self, folder: Path) -> list[Path]:
+        """The files from which a folder can be resumed."""
+        return [folder / name for name in self.resumed_from if (folder / name).is_file()]
+
+    def check_content(self, folder: Path) -> None:
+        """Refuse results that are links, or that take data from other files."""
+        check_folder(folder)
+        for file in self.resumable(folder):
+            if file.suffix == ".h5":
+                try:
+                    with open_stored(file):
+                        pass
+                except OutsideFolderError:
+                    raise
+                except InputError:  # if one is damaged, another is read
+                    continue
 
     def exists_error(self, path: Path, key: str) -> InputError:
         """The error for a folder that exists already."""
@@ -125,9 +106,7 @@ class FolderKind:
         return max(ages)[1]
 
 
-RUN = FolderKind(
-    "run", RUNS, LOCK_FILE, RESULT, checkpoint_files, "no checkpoint to resume from", _check_resumable
-)
+RUN = FolderKind("run", RUNS, RESULT, (CHECKPOINT, PREVIOUS), "no checkpoint to resume from")
 
 
 @dataclass(frozen=True)
@@ -227,8 +206,7 @@ def _check_choice(choice: FolderChoice, key: str) -> None:
             )
         if not kind.resumable(path):
             raise InputError(f"holds {kind.missing}; run without --resume", file=path, key="--resume")
-        if kind.check is not None:
-            kind.check(path)
+        kind.check_content(path)
     elif choice.named and not choice.force and path.exists() and os.listdir(path) != [kind.lock]:
         raise kind.exists_error(path, key)
     check_creatable(path, key)

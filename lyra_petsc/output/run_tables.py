@@ -18,6 +18,7 @@ from lyra_petsc.output.history import (
     check_columns,
     vector_columns,
 )
+from lyra_petsc.output.layout import HISTORY, OBSTACLES, PROBES, REACTIONS
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.terms.energies import ENERGIES
 
@@ -41,15 +42,15 @@ class RunTables:
         self._simulation = simulation
         scene, held = simulation.scene, simulation.problem.equations.held
         term_columns = tuple(simulation.energy_balance.column_names)
-        self.columns: dict[str, tuple[str, ...]] = {"history.csv": (*HISTORY_COLUMNS, *term_columns)}
+        self.columns: dict[str, tuple[str, ...]] = {HISTORY: (*HISTORY_COLUMNS, *term_columns)}
         if scene.probes:
-            self.columns["probes.csv"] = vector_columns(list(scene.probes))
+            self.columns[PROBES] = vector_columns(list(scene.probes))
         if scene.output.reactions and scene.handles:
             moments = [f"handle{n}_m{axis}" for n in held.with_slopes for axis in "xyz"]
             forces = vector_columns([f"handle{n}" for n in range(len(scene.handles))])
-            self.columns["reactions.csv"] = (*forces, *moments)
+            self.columns[REACTIONS] = (*forces, *moments)
         if scene.obstacles:
-            self.columns["obstacles.csv"] = OBSTACLE_COLUMNS
+            self.columns[OBSTACLES] = OBSTACLE_COLUMNS
         self._files: dict[str, History] = {}
 
     def check(self, folder: Path) -> None:
@@ -70,7 +71,7 @@ class RunTables:
             name: History(folder / name, columns, comm, resume_after=resume_after)
             for name, columns in self.columns.items()
         }
-        history = self._files["history.csv"]
+        history = self._files[HISTORY]
         if resume_after is not None and history.kept_until != resume_after:
             lost = f"the rows of steps {history.kept_until + 1} to {resume_after} are lost"
             self._simulation.notes.append(f"{history.path}: {lost}")
@@ -86,18 +87,18 @@ class RunTables:
             "dissipation": budget.dissipation,
             **energy_balance.columns(),
         }
-        rows: dict[str, Sequence[Row]] = {"history.csv": [history]}
-        if "probes.csv" in self.columns:
+        rows: dict[str, Sequence[Row]] = {HISTORY: [history]}
+        if PROBES in self.columns:
             means = {f"{name}_": mean for name, mean in self._probe_means().items()}
-            rows["probes.csv"] = [_vector_row(report, means)]
-        if "reactions.csv" in self.columns:
+            rows[PROBES] = [_vector_row(report, means)]
+        if REACTIONS in self.columns:
             handle_forces = energy_balance.handle_forces(len(self._simulation.scene.handles))
             forces = {f"handle{n}_": force for n, force in enumerate(handle_forces)}
             moments = {f"handle{n}_m": moment for n, moment in energy_balance.handle_moments().items()}
-            rows["reactions.csv"] = [_vector_row(report, forces | moments)]
+            rows[REACTIONS] = [_vector_row(report, forces | moments)]
         if names := list(self._simulation.scene.obstacles or {}):
             loads = zip(names, energy_balance.obstacle_forces(len(names)), strict=True)
-            rows["obstacles.csv"] = [
+            rows[OBSTACLES] = [
                 dict(zip(OBSTACLE_COLUMNS, (report.step, report.time, name, *map(float, load)), strict=True))
                 for name, load in loads
             ]

@@ -3,7 +3,7 @@
 A file is created with preallocated datasets for several states. To write a state is to write its rows into
 these datasets, and then its row in the file's table. A new file can hold as many states as exist already,
 within bounds, so that there are few files and little unused space. A state is announced, that is, listed in
-states.xdmf, when it is complete.
+states.xdmf, when it is complete on disk.
 
 failure.xdmf, failure.h5 and failure.txt hold the state before a failed step, the failing iterate and the
 cause.
@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,24 +23,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.file_operations import (
-    cannot_write,
-    reason,
-    replace_text,
-)
-from lyra_petsc.output.hdf5 import Attributes, Empty, create_file, rows_writable, write_rows
-from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.stored import (
-    TABLE,
-    OutsideFolderError,
-    check_sums,
-    state_files,
-    states_of,
-)
-from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
-from lyra_petsc.output.xdmf import (
+from lyra_petsc.errors import OutputError
+from lyra_petsc.output.file_operations import cannot_write, reason, replace_text, sync
+from lyra_petsc.output.hdf5 import Attributes, Empty, create_file, put_rows, rows_writable, write_rows
+from lyra_petsc.output.layout import (
+    CELLS_FILE,
+    FAILURE_DATA,
+    FAILURE_TEXT,
+    FAILURE_XDMF,
+    VTKHDF_FILE,
     XDMF_FILE,
+)
+from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.stored import TABLE, check_sums, state_files, states_in
+from lyra_petsc.output.vtkhdf_file import write_cells, write_vtkhdf
+from lyra_petsc.output.xdmf import (
     GrowingXdmf,
     StoredField,
     TimeSeries,
@@ -110,8 +107,7 @@ class StateWriter:
         self._orders = {"vertex": vertices} | ({} if triangles is None else {"triangle": triangles})
         self.n_triangles = n_triangles
         self._document = GrowingXdmf(self.folder / XDMF_FILE)  # of rank 0
-        self._states: list[WrittenState] = []  # of rank 0, for states.vtkhdf
-        self._n_in_vtkhdf = 0
+        self._n_in_vtkhdf = 0  # of rank 0
         self._series = TimeSeries(vertices.n_global, n_triangles)
         self._next = 0
         # the newest file: its path, the numbers of its states, and their fields
@@ -123,8 +119,8 @@ class StateWriter:
         if resume_after is not None:
             self._next = on_root(self._comm, lambda: self._truncate(resume_after))
 
-    def write(self, step: int, time: float, position: Array, fields: Fields) -> int:
-        """Write and announce one state; collective. Returns its number.
+    def write(self, step: int, time: float, position: Array, fields: Fields) -> Callable[[], None]:
+        """Write one state; collective.
 
         Parameters
         ----------
@@ -137,6 +133,13 @@ class StateWriter:
         fields : mapping of str to (str, (n_owned, ...) array)
             Further fields on this rank's vertices or triangles: floats or integers; names, types and
             trailing shapes are the same on every rank.
+
+        Returns
+        -------
+        callable
+            To be called on rank 0 before the next state is written, also in another thread: when the state is
+            listed in its file and on disk, it is listed in states.xdmf and, unless too few are new, in
+            states.vtkhdf.
 
         Raises
         ------
@@ -155,9 +158,9 @@ class StateWriter:
         state = WrittenState(number, int(step), float(time), self._path.name, described)
         sums = check_sums(slabs.values(), self._comm)
         rows = {f"{group_name(number)}/{name}": slab for name, slab in slabs.items()}
-        write_rows(self._path, rows, self._comm, publish=lambda: self._announce(state, sums))
+        write_rows(self._path, rows, self._comm)
         self._next += 1
-        return number
+        return lambda: self._announce(state, sums)
 
     def finish(self) -> None:
         """List all announced states in ``states.vtkhdf``; collective.
@@ -167,8 +170,13 @@ class StateWriter:
         OutputError
             On every rank, if ``states.vtkhdf`` cannot be written.
         """
+
+        def work() -> None:
+            if self._n_in_vtkhdf < self._next:
+                self._write_vtkhdf(states_in(self.folder, skip_damaged=True))
+
         if self._vtkhdf:
-            on_root(self._comm, lambda: self._write_vtkhdf(complete=True))
+            on_root(self._comm, work)
 
     def _begin_file(self, fields: tuple[StoredField, ...]) -> None:
         """Create a file for the next states; collective."""
@@ -200,13 +208,13 @@ class StateWriter:
         self._path, self._numbers, self._fields = path, range(first, first + slots), fields
 
     def _announce(self, state: WrittenState, sums: NDArray[np.uint64]) -> None:
-        """List a state in its file, in states.xdmf and, unless too few are new, states.vtkhdf (rank 0)."""
         row = state.number - self._numbers.start
         with rows_writable(self._path) as file:
-            table = file[TABLE]
-            table["time"][row], table["sums"][row] = state.time, sums
+            put_rows(file, f"{TABLE}/time", row, np.array([state.time]))
+            put_rows(file, f"{TABLE}/sums", row, sums[None])
             file.flush()
-            table["step"][row] = state.step  # which makes the row valid
+            put_rows(file, f"{TABLE}/step", row, np.array([state.step]))  # which makes the row valid
+        sync(self._path)
         grid = self._series.grid(state)
         try:
             if state.number == 0:
@@ -216,32 +224,24 @@ class StateWriter:
         except FileNotFoundError:  # removed or changed by somebody: write it again from the states' files
             if not self.folder.is_dir():
                 raise cannot_write(self._document.path, FileNotFoundError()) from None
-            self._document.replace(map(self._series.grid, _undamaged_states(self.folder)))
-        if self._vtkhdf:
-            self._states.append(state)
-            self._write_vtkhdf()
+            self._document.replace(map(self._series.grid, states_in(self.folder, skip_damaged=True)))
+        # the file is always written as a whole, so it is written less often the more states there are
+        if self._vtkhdf and state.number + 1 >= (1.0 + MAX_LAG) * self._n_in_vtkhdf:
+            self._write_vtkhdf(states_in(self.folder, skip_damaged=True))
 
-    def _write_vtkhdf(self, *, complete: bool = False) -> None:
-        """Write ``states.vtkhdf`` if it must be ``complete`` or lacks more states than `MAX_LAG` allows.
-
-        The file is always written as a whole, so it is written less often the more states there are.
-        """
-        new = len(self._states) - self._n_in_vtkhdf
-        if new == 0 or not (complete or new >= MAX_LAG * self._n_in_vtkhdf):
-            return
-        write_vtkhdf(self.folder, self._states, self.vertices.n_global, self.n_triangles)
-        self._n_in_vtkhdf = len(self._states)
+    def _write_vtkhdf(self, states: Sequence[WrittenState]) -> None:
+        write_vtkhdf(self.folder, states, self.vertices.n_global, self.n_triangles)
+        self._n_in_vtkhdf = len(states)
 
     def _truncate(self, last_step: int) -> int:
         """Announce the states up to ``last_step``, and only then remove the later ones (rank 0).
 
         Returns the number of the next state.
         """
-        keep = [state for state in _undamaged_states(self.folder) if state.step <= last_step]
+        keep = [state for state in states_in(self.folder, skip_damaged=True) if state.step <= last_step]
         self._document.replace(map(self._series.grid, keep))
         if self._vtkhdf:
-            self._states = keep
-            self._write_vtkhdf(complete=True)
+            self._write_vtkhdf(keep)
         stale = [] if self._vtkhdf else [self.folder / VTKHDF_FILE, self.folder / CELLS_FILE]
         kept = {state.file for state in keep}
         try:
@@ -263,28 +263,6 @@ def _units(datasets: Iterable[str]) -> dict[str, dict[str, int | float | str]]:
     """Attributes of a file that give the units of datasets of states, by their paths."""
     names = {path: path.rpartition("/")[2] for path in datasets}
     return {path: {"units": UNITS[name]} for path, name in names.items() if name in UNITS}
-
-
-def _undamaged_states(folder: Path) -> list[WrittenState]:
-    """The states in a run's folder, ordered by number; damaged files are skipped.
-
-    Raises
-    ------
-    InputError
-        For links out of the folder.
-    """
-    states: list[WrittenState] = []
-    for path in state_files(folder):
-        try:
-            states += states_of(path)
-        except OutsideFolderError:
-            raise
-        except InputError:
-            continue
-    return states
-
-
-FAILURE_DATA, FAILURE_XDMF, FAILURE_TEXT = "failure.h5", "failure.xdmf", "failure.txt"
 
 
 @dataclass(frozen=True)
@@ -352,10 +330,7 @@ def write_failure(
         )
         written.append(WrittenState(number, step + number, state.time, FAILURE_DATA, fields))
     attributes |= _units(datasets)
-    n = vertices.n_global
-    empty = {name: Empty((n, *rows.shape[1:]), rows.dtype) for name, rows in datasets.items()}
-    file = folder / FAILURE_DATA
-    write_rows(file, datasets, vertices.comm, lambda lengths: create_file(file, empty, attributes))
+    write_rows(folder / FAILURE_DATA, datasets, vertices.comm, create=attributes)
     document = TimeSeries(vertices.n_global, n_triangles).text(written)
     on_root(vertices.comm, lambda: replace_text(folder / FAILURE_XDMF, document))
 

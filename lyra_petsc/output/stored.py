@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -27,7 +26,8 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.mesh.mesh import Group, TriangleSurface
 from lyra_petsc.output.file_operations import reason
-from lyra_petsc.output.xdmf import MESH_FILE, StoredField, WrittenState, group_name
+from lyra_petsc.output.layout import MESH_FILE, RESULT, STATE_FILE
+from lyra_petsc.output.xdmf import StoredField, WrittenState, group_name
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -55,9 +55,6 @@ def import_h5py_in_background() -> None:
     Thread(target=work, name="lyra-petsc h5py").start()
 
 
-ENDINGS = (".h5", ".xdmf", ".vtkhdf", ".csv", ".yaml", ".json", ".txt", ".part")
-"""Endings of the files that a run writes."""
-
 _REMEDY = "a run's folder must hold all of its results"
 
 
@@ -74,7 +71,7 @@ def check_folder(folder: Path) -> None:
         For the first file that is not.
     """
     try:
-        names = sorted(entry.name for entry in os.scandir(folder) if entry.name.endswith(ENDINGS))
+        names = sorted(entry.name for entry in os.scandir(folder) if RESULT.fullmatch(entry.name))
     except OSError:  # reported where it is read
         return
     for name in names:
@@ -138,8 +135,6 @@ def _check_content(file: Any, path: Path) -> None:
 
 SUM = "sum"
 """Attribute of a dataset with its check sum."""
-
-STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
 
 TABLE = "written"
 """Group of a states file: a table with one row for each state that the file can hold.
@@ -248,14 +243,25 @@ def state_files(folder: Path) -> list[Path]:
     return [path for _, path in sorted((int(match[1]), path) for match, path in numbered if match)]
 
 
-def states_of(path: Path) -> list[WrittenState]:
-    """The states that are written in a states file.
+def states_in(folder: Path, *, skip_damaged: bool = False) -> list[WrittenState]:
+    """The states in a run's folder, ordered by number.
 
     Raises
     ------
     InputError
-        If the file is damaged.
+        For a damaged file, unless it is skipped, and for links out of the folder.
     """
+    states: list[WrittenState] = []
+    for path in state_files(folder):
+        try:
+            states += _states_of(path)
+        except InputError as error:
+            if isinstance(error, OutsideFolderError) or not skip_damaged:
+                raise
+    return states
+
+
+def _states_of(path: Path) -> list[WrittenState]:
     with open_stored(path) as file:
         table = file[TABLE]
         first, columns = int(table.attrs["first"]), json.loads(table.attrs["columns"].decode())

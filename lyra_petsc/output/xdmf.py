@@ -5,8 +5,7 @@ is followed by reserved space: an XML processing instruction that is filled with
 takes two writes. The first writes, into the reserved space, the state's text, another end of the document
 and the opening of another such instruction; readers still ignore all of it. The second overwrites the former
 end of the document with spaces, within one page of the file, so that a concurrent reader sees either the old
-or the new document. If the reserved space is used up, the file is copied and gets an eighth of its size as
-new reserved space.
+or the new document. If the reserved space is used up, the file is copied and gets new one.
 """
 
 from __future__ import annotations
@@ -20,9 +19,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from lyra_petsc.output.file_operations import atomic_write, cannot_write, open_output
-
-XDMF_FILE = "states.xdmf"
-MESH_FILE = "mesh.h5"
+from lyra_petsc.output.layout import MESH_FILE
 
 
 @dataclass(frozen=True)
@@ -148,8 +145,8 @@ RESERVE_END = b"?>\n"
 PAGE = 4096
 """Size of a block that a killed process writes either completely or not at all [bytes]."""
 
-MIN_RESERVE, MAX_RESERVE = 1 << 14, 1 << 20
-"""Bounds of the reserved space [bytes]; XML readers keep it in memory and refuse 10 MB."""
+RESERVE = 1 << 16
+"""Size of the reserved space [bytes]; XML readers keep it in memory."""
 
 
 class GrowingXdmf:
@@ -210,12 +207,12 @@ class GrowingXdmf:
             if copied:
                 with open(self.path, "rb") as old:
                     while new.tell() < copied:
-                        new.write(old.read(min(copied - new.tell(), MAX_RESERVE)))
+                        new.write(old.read(min(copied - new.tell(), RESERVE)))
             new.writelines(pieces)
             new.write(b" " * _pad(new.tell()))
             seam = new.tell()
             new.write(SEAM)
-            new.write(b" " * min(max(seam // 8, MIN_RESERVE), MAX_RESERVE) + RESERVE_END)
+            new.write(b" " * RESERVE + RESERVE_END)
             size = new.tell()
         self._seam, self._size = seam, size
 

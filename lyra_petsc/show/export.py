@@ -34,7 +34,7 @@ from lyra_petsc.output.file_operations import reason
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import check_creatable
 from lyra_petsc.output.tensors import is_tensor
-from lyra_petsc.show.render.render_plan import parse_numbers, pick_state
+from lyra_petsc.show.render.render_plan import OBSTACLE_COLOR, parse_numbers, pick_state
 
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
@@ -194,10 +194,6 @@ def _remove(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-SINGLE_RATE = 24.0
-"""States per second of an animation of a single state."""
-
-
 @dataclass(frozen=True)
 class ExportedStates:
     """States of a run to be exported.
@@ -285,7 +281,8 @@ class ExportedStates:
     def rate(self) -> float:
         """States per second, from the median of their intervals."""
         spacing = np.diff(self.times)
-        return round(1.0 / float(np.median(spacing)), 6) if len(spacing) else SINGLE_RATE
+        usual = 24.0  # of USD, for a single state
+        return round(1.0 / float(np.median(spacing)), 6) if len(spacing) else usual
 
 
 def select_states(run: StoredRun, times: str | None, every: int | None) -> ExportedStates:
@@ -429,7 +426,6 @@ def _write_array(
 
 ROOT = "/run"
 MESH = f"{ROOT}/cloth"
-OBSTACLE_COLOUR = (0.6, 0.63, 0.66)
 
 
 def write_usd(states: ExportedStates, folder: Path, name: str) -> None:
@@ -491,10 +487,11 @@ def _fill_stage(stage: Any, states: ExportedStates) -> None:
         _set_points(mesh, position, code)
     for field in states.fields:
         _set_field(mesh, primvars, states, field, codes)
+    colour = Gf.Vec3f(*(channel / 255.0 for channel in bytes.fromhex(OBSTACLE_COLOR[1:])))
     for label, obstacle in states.obstacles.items():
         mesh = _mesh(stage, f"{ROOT}/{label}", obstacle.triangles)
         mesh.GetPrim().SetDisplayName(obstacle.name)
-        mesh.CreateDisplayColorAttr([Gf.Vec3f(*OBSTACLE_COLOUR)])
+        mesh.CreateDisplayColorAttr([colour])
         mesh.CreateDisplayOpacityAttr([obstacle.opacity])
         obstacle_codes = [Usd.TimeCode.Default()] if obstacle.fixed else codes
         for code, position in zip(obstacle_codes, states.obstacle_points(obstacle), strict=False):

@@ -20,8 +20,8 @@ from lyra_petsc.mesh.obstacles import (
     box_corners,
     build_obstacles,
 )
+from lyra_petsc.output.layout import MESH_FILE, SUMMARY_FILE
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.scene.schema import Keyframe, Obstacle
 from lyra_petsc.terms.handles.motion import Motion
 
@@ -55,7 +55,7 @@ def _with_earlier_motion(
     run: StoredRun, obstacle: Solid | Container, earlier: Mapping[str, Any], until: float
 ) -> Solid | Container:
     """The obstacle with an earlier motion, an entry of summary.json, until a time [s]."""
-    file, motion = run.folder / "summary.json", None
+    file, motion = run.folder / SUMMARY_FILE, None
     if earlier.get("motion"):
         try:
             keyframes = [Keyframe.model_validate(keyframe) for keyframe in earlier["motion"]]
@@ -76,7 +76,8 @@ CIRCLE_POINTS = 48
 """Points per circle of a sphere or capsule."""
 PLANE_SIZE = 1.5
 """Side of the square that represents a plane, relative to the size of the sheets' motion."""
-PLANE_OPACITY, CONTAINER_OPACITY = 0.5, 0.2
+OPACITY = 0.3
+"""Opacity of planes and containers, which would hide the sheets."""
 
 _SQUARE: Ints = np.array([[0, 1, 2], [0, 2, 3]])
 _AXES = np.eye(3)
@@ -137,7 +138,7 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
             assert isinstance(obstacle, Container)
             tangents, half = _tangents(obstacle.normals[0]), 0.5 * PLANE_SIZE * size
             positions = partial(_square, obstacle, tangents, middle, half)
-            surfaces.append(ObstacleSurface(obstacle.name, _SQUARE, positions, fixed, True, PLANE_OPACITY))
+            surfaces.append(ObstacleSurface(obstacle.name, _SQUARE, positions, fixed, True, OPACITY))
             continue
         if spec.mesh is not None:
             assert isinstance(obstacle, Solid)
@@ -145,7 +146,7 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
         else:
             surface = shape_surface(spec)
         positions = partial(_moved_points, obstacle, surface.points)
-        opacity, smooth = CONTAINER_OPACITY if spec.inside else 1.0, spec.shape in ("sphere", "capsule")
+        opacity, smooth = OPACITY if spec.inside else 1.0, spec.shape in ("sphere", "capsule")
         surfaces.append(
             ObstacleSurface(obstacle.name, surface.triangles, positions, fixed, False, opacity, smooth)
         )

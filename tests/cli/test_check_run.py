@@ -63,7 +63,7 @@ def written(path: Path, **keys: object) -> Path:
         orders = [FileOrder(comm, np.arange(n), n) for n in (len(REST), len(TRIANGLES))]
         states = StateWriter(path, *orders, n_triangles=len(TRIANGLES))
         for i, x in enumerate((REST, DOWN, REST, ALL, REST)):
-            states.write(i, 0.1 * i, x, {})
+            states.write(i, 0.1 * i, x, {})()
     MPI.COMM_WORLD.Barrier()
     return path
 

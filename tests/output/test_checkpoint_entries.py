@@ -15,7 +15,8 @@ from mpi4py import MPI
 from physics import CLOTH, grid, scene_of, stepped
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.checkpoint import CHECKPOINT, ENTRIES, PREVIOUS, _encoded
+from lyra_petsc.output.checkpoint import ENTRIES, _encoded
+from lyra_petsc.output.layout import CHECKPOINT, PREVIOUS
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.output.stored import check_sum, import_h5py
 

@@ -10,7 +10,8 @@ from mpi4py import MPI
 from written_run import ENTRIES, REST, TRIANGLES, position, written
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.checkpoint import CHECKPOINT, CheckpointWriter, read_checkpoint
+from lyra_petsc.output.checkpoint import read_checkpoint, write_checkpoint
+from lyra_petsc.output.layout import CHECKPOINT
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.stored import import_h5py
@@ -28,7 +29,7 @@ def whole(tmp_path_factory):
     (folder / "summary.json").write_text(json.dumps(SUMMARY), encoding="utf-8")
     for step in (6, 7):
         arrays = {"position": position(step), "velocity": -position(step)}
-        CheckpointWriter(folder, ORDER).write(arrays, ENTRIES | {"step": step})
+        write_checkpoint(folder, ORDER, arrays, ENTRIES | {"step": step})()
     return folder
 
 

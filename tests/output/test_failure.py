@@ -11,17 +11,10 @@ from test_states import announced, on_first
 
 from lyra_petsc.errors import OutputError
 from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.output.layout import FAILURE_DATA, FAILURE_TEXT, FAILURE_XDMF, RESULT
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.run_folder import RESULT
-from lyra_petsc.output.states import (
-    FAILURE_DATA,
-    FAILURE_TEXT,
-    FAILURE_XDMF,
-    FailureState,
-    remove_failure,
-    write_failure,
-)
+from lyra_petsc.output.states import FailureState, remove_failure, write_failure
 
 pytestmark = pytest.mark.parallel(3)
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.run_folder import LOCK_FILE, FolderLock, FolderLocked, RunDirectory, choose_folder
+from lyra_petsc.output.layout import LOCK_FILE
+from lyra_petsc.output.run_folder import FolderLock, FolderLocked, RunDirectory, choose_folder
 
 pytestmark = pytest.mark.parallel(3)
 

@@ -8,7 +8,7 @@ import pytest
 
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output import hdf5
-from lyra_petsc.output.hdf5 import Empty, create_file, read_slab, write_rows
+from lyra_petsc.output.hdf5 import read_slab, write_rows
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.stored import import_h5py
 
@@ -37,9 +37,8 @@ def slab_of(comm, array):
 
 def write(comm, path, content, attributes=None):
     """Create a file for whole arrays, of which each rank writes its slab."""
-    empty = {name: Empty(rows.shape, rows.dtype) for name, rows in content.items()}
     slabs = {name: slab_of(comm, rows) for name, rows in content.items()}
-    write_rows(path, slabs, comm, prepare=lambda lengths: create_file(path, empty, attributes or {}))
+    write_rows(path, slabs, comm, create=attributes or {})
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 1001])
@@ -64,15 +63,9 @@ def test_slabs_of_all_ranks_become_one_array(comm, shared_tmp, way, n):
 
 def test_ranks_without_rows(comm, shared_tmp, way):
     path, x = shared_tmp / "a.h5", whole(100)
-    mine, lengths = x if comm.rank == comm.size - 1 else x[:0], []
-
-    def prepare(found):
-        lengths.extend(found)
-        create_file(path, {"x": Empty(x.shape, x.dtype)})
-
-    write_rows(path, {"x": mine}, comm, prepare, lambda: lengths.append("published"))
+    mine = x if comm.rank == comm.size - 1 else x[:0]
+    write_rows(path, {"x": mine}, comm, create={})
     np.testing.assert_array_equal(h5py.File(path, "r")["x"][()], x)
-    assert lengths == ([100, "published"] if comm.rank == 0 else [])
 
 
 def test_reading_with_another_partition_of_rows(comm, shared_tmp, way):
@@ -105,25 +98,22 @@ def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, way):
     np.testing.assert_array_equal(h5py.File(path, "r")["x"][()], whole(20_000))
 
 
-@pytest.mark.parametrize("place", ["prepare", "rows", "publish"])
+@pytest.mark.parametrize("place", ["creation", "rows"])
 def test_a_failure_on_one_rank_is_one_on_all(comm, shared_tmp, way, monkeypatch, place):
     """Also where other ranks have more rows than are received."""
     path, x = shared_tmp / "a.h5", whole(500)
     write(comm, path, {"x": x, "y": x})
 
-    def fail(*given):
-        raise OutputError("a.h5: cannot be written: No space left on device")
+    def disk_full(*arguments):
+        raise OSError(errno.ENOSPC, "as the library words it")
 
-    if place == "rows":
-
-        def disk_full(self, *given):
-            raise OSError(errno.ENOSPC, "as the library words it")
-
-        if comm.rank in (0, comm.size - 1):
-            monkeypatch.setattr(h5py.Dataset, "__setitem__", disk_full)
-    how = {} if place == "rows" else {place: fail}
+    if place == "creation":
+        monkeypatch.setattr("os.posix_fallocate", disk_full)
+    elif comm.rank in (0, comm.size - 1):
+        monkeypatch.setattr(hdf5, "put_rows", disk_full)
+    create = {} if place == "creation" else None
     with pytest.raises(OutputError, match=r"a\.h5: cannot be written: No space left on device"):
-        write_rows(path, {"x": slab_of(comm, x), "y": slab_of(comm, x)}, comm, **how)
+        write_rows(path, {"x": slab_of(comm, x), "y": slab_of(comm, x)}, comm, create)
     monkeypatch.undo()
     write_rows(path, {"x": slab_of(comm, -x)}, comm)
     np.testing.assert_array_equal(h5py.File(path, "r")["x"][()], -x)

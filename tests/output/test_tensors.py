@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from written_run import TRIANGLES, stress, tensor, written
 
+from lyra_petsc.output.layout import XDMF_FILE
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.tensors import plane_components, six_components
-from lyra_petsc.output.xdmf import XDMF_FILE
 from lyra_petsc.show.export import export_run
 
 NUMBERED = np.arange(6.0)[None]

@@ -8,11 +8,12 @@ from written_run import REST, TRIANGLES, position, ring, tensor, velocity
 
 from lyra_petsc.errors import OutputError
 from lyra_petsc.output import states as states_module
+from lyra_petsc.output.layout import CELLS_FILE, VTKHDF_FILE
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.read_run import stored_states
 from lyra_petsc.output.states import StateWriter
-from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE
+from lyra_petsc.parallel import on_root
 
 pytestmark = pytest.mark.parallel(3)
 
@@ -29,7 +30,7 @@ class Writer:
         )
 
     def write(self, i, fields=True):
-        self.states.write(
+        announce = self.states.write(
             i,
             0.1 * i,
             position(i)[self.vertices],
@@ -41,6 +42,7 @@ class Writer:
             if fields
             else {},
         )
+        on_root(self.states.vertices.comm, announce)
 
 
 @pytest.fixture

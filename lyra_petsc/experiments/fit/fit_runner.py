@@ -12,7 +12,6 @@ import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ from lyra_petsc.experiments.fit.readings import Reading, readings_of, readings_w
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_triangles
 from lyra_petsc.mesh.topology import connected_pieces
-from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose_folder, existing_files
+from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose_folder
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.fit_block import Quantity
@@ -52,9 +51,8 @@ TRIALS_FILE = "trials.json"
 FIT = FolderKind(
     "fit",
     Path("fits"),
-    "fit.lock",
     re.compile(r"(trials\.json|fit\.(csv|json)|report\.(html|md)|[\w-]+\.(png|svg))(\.part)?"),
-    partial(existing_files, TRIALS_FILE),
+    (TRIALS_FILE,),
     "no evaluations to go on from",
     folders=("plots",),
 )

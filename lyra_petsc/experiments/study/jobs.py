@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
@@ -24,7 +23,7 @@ from lyra_petsc.experiments.case import Launcher, read_record, save_record
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, scene_of
 from lyra_petsc.output.file_operations import make_folder, writing
 from lyra_petsc.output.recorder import Recorder
-from lyra_petsc.output.run_folder import FolderKind, checkpoint_files, existing_files
+from lyra_petsc.output.run_folder import RUN, FolderKind
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
@@ -174,9 +173,8 @@ RESULT = re.compile(
 STUDY = FolderKind(
     "study",
     Path("studies"),
-    "study.lock",
     RESULT,
-    partial(existing_files, REQUEST_FILE),
+    (REQUEST_FILE,),
     "no study to resume",
     folders=(CASES,),
 )
@@ -287,7 +285,7 @@ def _run_repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Res
                 setattr(result, count, sum(getattr(report, count) for report in reports))
             result.shortest, result.longest = min(lengths, default=0.0), max(lengths, default=0.0)
             result.end, result.linear_solver = simulation.time, simulation.stepper.preset
-            for path in checkpoint_files(folder) if comm.rank == 0 else ():
+            for path in RUN.resumable(folder) if comm.rank == 0 else ():
                 path.unlink(missing_ok=True)
 
         def slowest(seconds: float) -> float:

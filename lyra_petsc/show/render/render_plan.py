@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
+from lyra_petsc.output.layout import SCENE_FILE
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
@@ -41,10 +42,10 @@ SHEET_COLORS = (
     ("#5c6675", "#b5bac2"),
 )
 """Front and back of each of several sheets, in turn."""
+OBSTACLE_COLOR = "#9aa0a8"
 FILM, SHEET = "film.mp4", "sheet.png"
-MAX_PICTURES = 1000
-SIGHT_STATES = 9
-"""Number of states from which the direction of the camera is chosen."""
+FEW_STATES = 24
+"""Number of states that choose the direction of the camera, and the colours of the live page."""
 
 MAX_FPS = 240.0
 """Upper bound of ``--fps`` (frames per second)."""
@@ -211,7 +212,7 @@ def scene_with_settings(run: StoredRun, settings: Sequence[str]) -> Scene:
             raise InputError(f"{text!r}: the run is done, only render.… can be changed", key="--set")
     if not settings:
         return run.scene
-    return load_scene(run.folder / "scene.yaml", settings, meshes_needed=False)
+    return load_scene(run.folder / SCENE_FILE, settings, meshes_needed=False)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -242,12 +243,7 @@ def parse_numbers(text: str, key: str, example: str) -> list[float]:
 
 
 def _times(text: str | None) -> list[float]:
-    times = list(dict.fromkeys(parse_numbers(text, "--at", "0.25,1,2"))) if text is not None else []
-    if len(times) > MAX_PICTURES:
-        raise InputError(
-            f"names {len(times)} times, at most {MAX_PICTURES} are drawn; see --film", key="--at"
-        )
-    return times
+    return list(dict.fromkeys(parse_numbers(text, "--at", "0.25,1,2"))) if text is not None else []
 
 
 def _range(options: RenderOptions) -> ColourRange | None:
@@ -267,7 +263,7 @@ def _check_speeds(options: RenderOptions) -> None:
 
 def run_line_of_sight(run: StoredRun, scene: Scene) -> Array:
     """Unit vector from the sheet to the camera, chosen by a few states of the whole run."""
-    shapes = (run.positions[state] for state in spread_states(run.times, SIGHT_STATES))
+    shapes = (run.positions[state] for state in spread_states(run.times, FEW_STATES))
     return line_of_sight(scene, up_direction(scene), shapes, run.triangles)
 
 

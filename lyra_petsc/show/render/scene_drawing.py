@@ -14,7 +14,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.show.render.camera import PerspectiveCamera, horizon
 from lyra_petsc.show.render.colour_quantities import ColourQuantity, material_coordinates, round_numbers
 from lyra_petsc.show.render.opengl import import_pyvista, off_screen_plotter
-from lyra_petsc.show.render.render_plan import RenderPlan, decimals
+from lyra_petsc.show.render.render_plan import OBSTACLE_COLOR, RenderPlan, decimals
 from lyra_petsc.show.render.sheet_geometry import HeldVertices, sheet_numbers, split_at_seams, vertex_normals
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ Image = NDArray[np.uint8]
 
 SKY, HORIZON = "#d9e2ec", "#ecebe8"
 INK = "#2b2f36"
-HANDLE_COLOR, WIND_COLOR, OBSTACLE_COLOR = "#30343b", "#6d8fae", "#9aa0a8"
+HANDLE_COLOR, WIND_COLOR = "#30343b", "#6d8fae"
 MAP, SIGNED_MAP = "viridis", "coolwarm"
 
 OBSTACLE_MARGIN = 0.25
@@ -35,7 +35,7 @@ FLOOR_PIXELS = 512
 BLUR = 0.012
 """Radius of the shadow's soft edge, relative to the side of the floor."""
 DARKNESS = 0.42
-FLOOR_COLOR = (225, 224, 221)
+FLOOR_COLOR = "#e1e0dd"
 FLOOR_GAP = 0.02
 """Height of the sheets' lowest point above the floor, relative to the size of the motion."""
 
@@ -382,7 +382,7 @@ class Ground:
     def picture(self, x: Array) -> Image:
         """(n, n, 4) texture of the floor with the shadow of the sheet at positions ``x`` (V, 3) [m]."""
         from PIL import Image as Pictures
-        from PIL import ImageFilter
+        from PIL import ImageColor, ImageFilter
 
         at = x @ self._bounds.axes.T
         flat = np.zeros_like(x)
@@ -393,7 +393,9 @@ class Ground:
         blurred = mask.filter(ImageFilter.GaussianBlur(BLUR * FLOOR_PIXELS))
         shade = DARKNESS * (np.asarray(blurred, dtype=np.float32) / 255.0)
         floor = np.empty((FLOOR_PIXELS, FLOOR_PIXELS, 4), dtype=np.uint8)
-        floor[:, :, :3] = np.asarray(FLOOR_COLOR, dtype=np.float32) * (1.0 - shade[:, :, None])
+        floor[:, :, :3] = np.array(ImageColor.getrgb(FLOOR_COLOR), dtype=np.float32) * (
+            1.0 - shade[:, :, None]
+        )
         floor[:, :, 3] = self._opacity
         return floor
 

@@ -8,8 +8,8 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.topology import unique_edges
+from lyra_petsc.output.layout import MESH_FILE
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.show.render.opengl import import_pyvista
 from lyra_petsc.terms.handles.motion import Window
 

@@ -18,15 +18,13 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.extras import missing_packages
 from lyra_petsc.output.file_operations import replace_text
+from lyra_petsc.output.layout import FAILURE_TEXT, SCENE_FILE
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.parallel import ALONE
 from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, colour, empty_figure, make_drawing, surface
 from lyra_petsc.show.report.run_facts import ENERGIES, Facts, advice
-
-MANY_POINTS = 3000
-"""Number of points from which a line is drawn as pixels."""
 
 
 def energies(facts: Facts) -> Drawing:
@@ -105,8 +103,7 @@ def _axes(facts: Facts, labels: Sequence[str], height: float) -> tuple[Any, Any]
 
 
 def _line(axes: Any, x: Array, y: Array, number: int, name: str) -> None:
-    pixels = len(x) > MANY_POINTS
-    axes.plot(x, y, color=colour(number), label=name or None, lw=1.4, rasterized=pixels)
+    axes.plot(x, y, color=colour(number), label=name or None, lw=1.4)
 
 
 SLOWEST = 5
@@ -192,7 +189,7 @@ def _outcome(facts: Facts, done: float) -> str:
         "unknown": f"How the run ended is not known (no summary.json); its last step is at {now}.",
         "stopped": f"The run was to stop at {now}, {part}, by -ts_max_steps.",
     }
-    return texts.get(facts.outcome, f"The run stopped at {now}, {part}: {facts.outcome}")
+    return texts.get(facts.run.outcome, f"The run stopped at {now}, {part}: {facts.run.outcome}")
 
 
 def _energy(page: Report, facts: Facts) -> None:
@@ -277,9 +274,11 @@ def _notes(page: Report, facts: Facts) -> None:
     page.bullets(notes)
     if not notes:
         page.paragraph(
-            "None." if facts.outcome not in ("running", "killed") else "Written when a run ends by itself."
+            "None."
+            if facts.run.outcome not in ("running", "killed")
+            else "Written when a run ends by itself."
         )
-    text = facts.run.folder / "failure.txt"
+    text = facts.run.folder / FAILURE_TEXT
     if facts.failed and text.is_file():
         page.paragraph("Why the solver stopped (failure.txt; failure.xdmf shows where):")
         page.code(text.read_text(encoding="utf-8", errors="replace"))
@@ -288,7 +287,7 @@ def _notes(page: Report, facts: Facts) -> None:
 def _settings(page: Report, facts: Facts) -> None:
     page.heading("Settings")
     page.paragraph("The scene as understood, all defaults filled in:")
-    page.code((facts.run.folder / "scene.yaml").read_text(encoding="utf-8", errors="replace"))
+    page.code((facts.run.folder / SCENE_FILE).read_text(encoding="utf-8", errors="replace"))
     options = facts.summary.get("petsc_options")
     if options:
         page.paragraph("PETSc options in force, ours included:")

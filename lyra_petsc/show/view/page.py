@@ -19,14 +19,10 @@ from vtkmodules.vtkRenderingCore import vtkCellPicker
 
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.run_folder import is_locked
 from lyra_petsc.parallel import ALONE
 from lyra_petsc.show.render.colour_quantities import quantity, quantity_names
 from lyra_petsc.show.render.draw import fitted_drawing
-from lyra_petsc.show.render.render_plan import RenderOptions, make_plan, spread_states
-
-FITTED_STATES = 24
-"""Number of states to which camera and colours are fitted."""
+from lyra_petsc.show.render.render_plan import FEW_STATES, RenderOptions, make_plan, spread_states
 
 POLL_SECONDS = 0.5
 """Interval [s] at which the page looks for new states."""
@@ -84,7 +80,7 @@ class RunPage:
             wind=wind is not None and any(wind.velocity),
             ground=False,
             settings=settings,
-            fitted_states=FITTED_STATES,
+            fitted_states=FEW_STATES,
         )
         self._plan = make_plan(options)
         self._run = self._plan.run
@@ -117,11 +113,8 @@ class RunPage:
         self._show()
 
     def _status(self) -> str:
-        outcome = str(self._run.summary.get("outcome", ""))
-        if outcome == "running" and not is_locked(self._run.folder):
-            outcome = "broken off"
-        sizes = f"{len(self._run.rest):,} vertices · {len(self._run)} states"
-        return f"{sizes} · {outcome}" if outcome else sizes
+        run = self._run
+        return f"{len(run.rest):,} vertices · {len(run)} states · {run.outcome}"
 
     # -- what is shown -------------------------------------------------------------------------------
 
@@ -151,7 +144,7 @@ class RunPage:
         shown, limits = None, (0.0, 1.0)
         if name != PLAIN:
             shown = quantity(self._run, name).on_vertices(self._run)
-            states = spread_states(self._run.times, FITTED_STATES)
+            states = spread_states(self._run.times, FEW_STATES)
             chosen = plan.limits if name == self._first_field else None
             limits = shown.limits(np.array([shown.percentiles(i) for i in states]), chosen)
         self._drawing.colour_by(shown, limits)

@@ -52,7 +52,7 @@ def write_run(
     order = FileOrder(MPI.COMM_SELF, np.arange(mesh.n_vertices), mesh.n_vertices)
     writer = StateWriter(folder, order, n_triangles=mesh.n_triangles)
     for number, (time, x) in enumerate(zip(TIME_KEYS, states, strict=True)):
-        writer.write(number, time, x, {})
+        writer.write(number, time, x, {})()
     names = "kinetic_energy,membrane_energy,bending_energy,potential_energy"
     rows = [f"{n},{TIME_KEYS[n]!r},{','.join(map(repr, row))}" for n, row in enumerate(energies)]
     (folder / "history.csv").write_text("\n".join([f"step,time,{names}", *rows]) + "\n")
