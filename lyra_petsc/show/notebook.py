@@ -125,8 +125,7 @@ class Run(StoredRun):
 
     def _repr_html_(self) -> str:
         title = html.escape(self.scene.title or self.name)
-        outcome = html.escape(str(self.summary.get("outcome", "")))
-        return f"<b>{title}</b>, {outcome}: <code>{html.escape(repr(self))}</code>"
+        return f"<b>{title}</b>, {html.escape(self.outcome)}: <code>{html.escape(repr(self))}</code>"
 
     def render(self, at: float | None = None, *, film: bool | str = False, **options: Any) -> Media:
         """A picture or a film, as drawn by the command ``render``; not collective.

@@ -6,7 +6,7 @@ The support of a set of points for a direction n is the largest product x · n o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,12 +23,12 @@ BAR_HEIGHT = 0.12
 FRAMED_STATES = 95.0
 """Percentage of the states that are entirely in the picture, unless the scene says otherwise."""
 
-ELEVATIONS = (15.0, 25.0, 35.0, 50.0)
-AZIMUTHS = 24
-MIN_VISIBLE = 0.05
-"""Added to the visible fraction of a state's area, so that a hidden state has a large but finite weight."""
+LOWEST, HIGHEST = 15.0, 50.0
+"""Bounds of the camera's elevation above the horizon [degrees]."""
+FRONT_BONUS = 0.05
+"""Part of the sheet's area that the side towards the viewer counts as seen in addition."""
 FIRST_WEIGHT = 3.0
-"""Weight of the first state, with which films begin."""
+"""Weight of the first state, with which films begin, among the states that choose the direction."""
 SIDE_ANGLE = 25.0
 """Angle [degrees] between the camera and the direction that sees most of the sheet; it shows folds."""
 
@@ -65,6 +65,9 @@ def up_direction(scene: Scene) -> Array:
 def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: Ints) -> Array:
     """Unit vector from the sheet to the camera.
 
+    Unless the scene gives it, the azimuth is `SIDE_ANGLE` beside the horizontal direction that sees most of
+    the sheet, on its front side, and the elevation compares what is seen from there and from above.
+
     Parameters
     ----------
     scene : Scene
@@ -76,49 +79,27 @@ def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: I
     chosen = _scene_camera(scene).line_of_sight
     if chosen is not None:
         return _unit(np.array(chosen))
-    azimuths = 2.0 * math.pi * np.arange(AZIMUTHS) / AZIMUTHS
-    corners = [x[triangles] for x in shapes]
-    normals = [np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]) for c in corners]
-    best = azimuths[int(np.argmax(_visibility(up, azimuths, normals).max(axis=1)))]
-    aside = best + math.radians(SIDE_ANGLE) * np.array([1.0, -1.0])
-    seen = _visibility(up, aside, normals) * [[1.05], [1.0]]
-    turned, raised = np.unravel_index(int(np.argmax(seen)), seen.shape)
-    return direction(up, float(aside[turned]), math.radians(ELEVATIONS[int(raised)]))
-
-
-def _visibility(up: Array, azimuths: Array, normals: Sequence[Array]) -> Array:
-    """Visibility of the sheet from each direction, (azimuths, elevations).
-
-    A mean over states of the visible fraction f of the sheet's area, ⟨f⁻²⟩^(-1/2), in which a state seen from
-    its edge outweighs many that are seen a little better. Directions of similar visibility are preferred
-    if they see the sheet's front side, and then if they are close to the front.
-
-    Parameters
-    ----------
-    up : (3,)
-    azimuths : (n,) [rad]
-    normals : sequence of (F, 3)
-        Normals of the triangles in each state; their lengths are proportional to the areas.
-    """
-    elevations = [math.radians(elevation) for elevation in ELEVATIONS]
-    sights = np.array([direction(up, float(a), e) for a in azimuths for e in elevations])
-    squares, facing = np.zeros(len(sights)), np.zeros(len(sights))
-    for number, areas in enumerate(normals):
-        towards = areas @ sights.T
-        whole = max(float(np.linalg.norm(areas, axis=1).sum()), 1e-300)
-        weight = 1.0 if number else FIRST_WEIGHT
-        squares += weight / (MIN_VISIBLE + np.abs(towards).sum(axis=0) / whole) ** 2
-        facing += towards.sum(axis=0)
-    mean = 1.0 / np.sqrt(np.maximum(squares, 1e-300))
-    preferred: Array = mean * (1.0 + 0.1 * np.sign(facing) + 0.05 * sights @ horizon(up)[1])
-    return preferred.reshape(len(azimuths), len(elevations))
-
-
-def direction(up: Array, azimuth: float, elevation: float) -> Array:
-    """Unit vector at angles [rad] from the front, about ``up`` and above the horizon."""
     side, front = horizon(up)
-    level = math.cos(azimuth) * front + math.sin(azimuth) * side
-    return math.cos(elevation) * level + math.sin(elevation) * up
+    axes = np.array([side, front, up])
+    seen, facing = np.zeros((3, 3)), np.zeros(3)
+    for number, positions in enumerate(shapes):
+        corners = positions[triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ axes.T
+        areas = np.linalg.norm(normals, axis=1, keepdims=True)
+        weight = 1.0 if number else FIRST_WEIGHT
+        # s @ seen @ s: area times the squared cosine between the normal and a direction s
+        seen += weight * normals.T @ np.divide(normals, areas, out=np.zeros_like(normals), where=areas > 0.0)
+        facing += weight * normals.sum(axis=0)
+    # of nearly equal directions that towards the viewer, where x points to the right
+    seen[1, 1] += FRONT_BONUS * np.trace(seen)
+    facing[1] += FRONT_BONUS * np.trace(seen)
+    level, directions = np.linalg.eigh(seen[:2, :2])
+    x, y = directions[:, 1] * math.copysign(1.0, float(directions[:, 1] @ facing[:2]))
+    azimuth = math.atan2(x, y) - math.copysign(math.radians(SIDE_ANGLE), x)
+    steep = math.degrees(math.atan2(math.sqrt(seen[2, 2]), math.sqrt(max(float(level[1]), 0.0))))
+    elevation = math.radians(min(max(steep, LOWEST), HIGHEST))
+    towards = math.cos(azimuth) * front + math.sin(azimuth) * side
+    return math.cos(elevation) * towards + math.sin(elevation) * up
 
 
 def horizon(up: Array) -> tuple[Array, Array]:

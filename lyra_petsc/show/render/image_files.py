@@ -22,7 +22,6 @@ Image = NDArray[np.uint8]
 
 TILES = 6
 """Pictures on a contact sheet."""
-COLUMNS = 3
 GAP = 4
 """Pixels between the pictures."""
 MAX_TEXTURE_PIXELS = 4096
@@ -71,7 +70,7 @@ def half_size(image: Image) -> Image:
 
 def contact_sheet(tiles: Sequence[Image]) -> Image:
     """Pictures of equal size, arranged in rows on a white background."""
-    columns = min(COLUMNS, len(tiles))
+    columns = math.ceil(math.sqrt(len(tiles)))
     height, width = (size + GAP for size in tiles[0].shape[:2])
     rows = math.ceil(len(tiles) / columns)
     sheet = np.full((rows * height - GAP, columns * width - GAP, 3), 255, dtype=np.uint8)

@@ -13,7 +13,6 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.output import read_run
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.run_folder import is_locked
 from lyra_petsc.show.report.document import percent, short
 
 ENERGIES = {column: column.removesuffix("_energy") for column in read_run.ENERGIES}
@@ -29,19 +28,21 @@ class Facts:
     run : StoredRun
     columns : dict of str to (n,) array
         The history; row 0 is the initial state.
-    summary : dict
-        summary.json; empty if it is missing.
     """
 
     run: StoredRun
     columns: dict[str, Array]
-    summary: dict[str, Any]
 
     @classmethod
     def of(cls, run: StoredRun) -> Facts:
         """Read the history and the summary of a run."""
         history = run.history
-        return cls(run, {name: np.asarray(history[name], float) for name in HISTORY_COLUMNS}, run.summary)
+        return cls(run, {name: np.asarray(history[name], float) for name in HISTORY_COLUMNS})
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """summary.json; empty if it is missing."""
+        return self.run.summary
 
     def steps(self, name: str) -> Array:
         """A column without the row of the initial state."""
@@ -51,12 +52,6 @@ class Facts:
     def static(self) -> bool:
         """Whether the run is a static analysis, whose time is the load factor."""
         return self.run.scene.time.static
-
-    @cached_property
-    def outcome(self) -> str:
-        """``done``, ``running``, ``killed``, ``unknown``, or the message with which the run stopped."""
-        outcome = str(self.summary.get("outcome", "unknown"))
-        return "killed" if outcome == "running" and not is_locked(self.run.folder) else outcome
 
     @property
     def failed(self) -> bool:
@@ -113,7 +108,7 @@ class Facts:
     @property
     def phases(self) -> dict[str, float]:
         """Wall time [s] by phase since the last start or resumption; empty if the run is not finished."""
-        return {} if self.outcome in ("running", "killed") else dict(self.summary.get("wall_seconds", {}))
+        return {} if self.run.outcome in ("running", "killed") else dict(self.summary.get("wall_seconds", {}))
 
     def share(self, phase: str) -> float:
         """Fraction of the wall time that a phase took."""
@@ -121,23 +116,14 @@ class Facts:
         return self.phases.get(phase, 0.0) / total if total else 0.0
 
 
-MANY_REJECTED = 0.05
-"""Rejected attempts over accepted steps."""
+NOTABLE = 0.05
+"""Rejected attempts over accepted steps, or lost energy over the largest change of one, to be mentioned."""
 
 MANY_NEWTON = 8.0
 """Mean Newton iterations per step."""
 
 MANY_LINEAR = 100.0
 """Mean linear iterations per Newton iteration."""
-
-MUCH_OUTPUT = 0.2
-"""Fraction of the wall time."""
-
-FEW_VERTICES = 300
-"""Vertices per rank."""
-
-MUCH_LOSS = 0.05
-"""Numerical dissipation relative to the largest change of an energy."""
 
 Rule = Callable[[Facts], Iterator[str]]
 
@@ -153,14 +139,14 @@ def _how_to_continue(facts: Facts) -> Iterator[str]:
     if facts.failed:
         for hint in facts.summary["failure"].get("advice", []):
             yield f"The solver stopped. Try {hint}."
-    elif facts.outcome == "killed":
+    elif facts.run.outcome == "killed":
         yield f"The run was killed before its end. It goes on from the newest checkpoint with: {again}"
-    elif facts.outcome not in ("done", "running", "unknown"):
+    elif facts.run.outcome not in ("done", "running", "unknown"):
         yield f"The run was stopped before its end. It goes on with: {again}"
 
 
 def _rejected_steps(facts: Facts) -> Iterator[str]:
-    if facts.n_steps == 0 or facts.rejected <= MANY_REJECTED * facts.n_steps:
+    if facts.n_steps == 0 or facts.rejected <= NOTABLE * facts.n_steps:
         return
     seen = f"{facts.rejected} attempts at a step were rejected over {facts.n_steps} accepted steps"
     time, median = facts.run.scene.time, float(np.median(facts.steps("dt")))
@@ -197,24 +183,6 @@ def _linear(facts: Facts) -> Iterator[str]:
     )
 
 
-def _output(facts: Facts) -> Iterator[str]:
-    share = facts.share("output")
-    if share > MUCH_OUTPUT:
-        yield (
-            f"Writing took {percent(share)} of the wall time. A longer output.every and fewer output.fields "
-            "write less."
-        )
-
-
-def _ranks(facts: Facts) -> Iterator[str]:
-    ranks, vertices = facts.summary.get("ranks", 1), len(facts.run.rest)
-    if ranks > 1 and vertices < FEW_VERTICES * ranks:
-        yield (
-            f"{ranks} ranks share {vertices} vertices, {vertices // ranks} each: too few to pay. "
-            "Try fewer ranks."
-        )
-
-
 def _accuracy(facts: Facts) -> Iterator[str]:
     time = facts.run.scene.time
     error, tolerance = facts.summary.get("estimated_error"), time.tolerance
@@ -226,7 +194,7 @@ def _accuracy(facts: Facts) -> Iterator[str]:
     if facts.static or facts.turnover == 0.0 or time.scheme not in ("beuler", "semi-implicit"):
         return
     lost = float(facts.scheme_loss[-1])
-    if lost > MUCH_LOSS * facts.turnover:
+    if lost > NOTABLE * facts.turnover:
         yield (
             f"The time scheme ({time.scheme}) took away {short(lost)} J, {percent(lost / facts.turnover)} of "
             "the largest change of an energy. A smaller time.step loses less, and so do bdf2, midpoint and "
@@ -234,12 +202,4 @@ def _accuracy(facts: Facts) -> Iterator[str]:
         )
 
 
-RULES: tuple[Rule, ...] = (
-    _how_to_continue,
-    _rejected_steps,
-    _newton,
-    _linear,
-    _output,
-    _ranks,
-    _accuracy,
-)
+RULES: tuple[Rule, ...] = (_how_to_continue, _rejected_steps, _newton, _linear, _accuracy)
