@@ -17,7 +17,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
@@ -26,6 +25,8 @@ from lyra_petsc.output.stored import import_h5py, open_stored
 from lyra_petsc.parallel import on_one_machine, on_root
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     from lyra_petsc.output.ordering import FileOrder
 
 Attributes: TypeAlias = Mapping[str, Mapping[str, int | float | str | np.uint64]]
