@@ -38,7 +38,7 @@ def digest(package: Path) -> str:
     module.
     """
     packages = sorted({package, Path(__file__).parent})
-    files = [file for each in packages for file in sorted(each.rglob("*.py"))]
+    files = [file for package in packages for file in sorted(package.rglob("*.py"))]
     return sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
@@ -73,14 +73,14 @@ class KernelCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled function for argument types ``sig``; None if there is none or the file is damaged."""
         try:
-            found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            overload = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception:  # reading a damaged file may raise anything
             with suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]
             return None
         # ranks that compile for different types at the same time may choose the same name
         types = normalize_signature(sig)[0]  # type: ignore[no-untyped-call]
-        return found if found is not None and found.signature.args == types else None
+        return overload if overload is not None and overload.signature.args == types else None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Store a compiled function if the disk permits."""

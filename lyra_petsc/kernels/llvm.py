@@ -47,15 +47,15 @@ class CodeBuilder:
 
     def index_entry(self, begin: Value, position: Value) -> Value:
         """An entry of an array of indices, as a 64-bit integer."""
-        found = self.builder.load(self.builder.gep(begin, [position]))
-        return found if found.type == INDEX else self.builder.zext(found, INDEX)
+        entry = self.builder.load(self.builder.gep(begin, [position]))
+        return entry if entry.type == INDEX else self.builder.zext(entry, INDEX)
 
     def load(self, pointer: Value, kind: Any = None) -> Value:
         """A vector (of four numbers by default) of the numbers in memory from a pointer on."""
         kind = self.vector4 if kind is None else kind
-        found = self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()))
-        found.align = self._size
-        return found
+        vector = self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()))
+        vector.align = self._size
+        return vector
 
     def store(self, vector: Value, pointer: Value) -> None:
         self.builder.store(vector, self.builder.bitcast(pointer, vector.type.as_pointer())).align = self._size
@@ -85,18 +85,18 @@ class CodeBuilder:
         of_pairs = zip(self._unpack(self.arguments[name]), self._types[name], strict=True)
         return [self._vectors_of(pair, kinds) for pair, kinds in of_pairs]
 
-    def _vectors_of(self, given: Value, kinds: Any) -> list[Value]:
-        return [self._vector_of_sum(one, kind) for one, kind in zip(self._unpack(given), kinds, strict=True)]
+    def _vectors_of(self, pair: Value, kinds: Any) -> list[Value]:
+        return [self._vector_of_sum(one, kind) for one, kind in zip(self._unpack(pair), kinds, strict=True)]
 
-    def _vector_of_sum(self, given: Value, kind: Any) -> Value:
+    def _vector_of_sum(self, terms: Value, kind: Any) -> Value:
         if not isinstance(kind[0], types.BaseTuple):
-            return self.vector_of(self._unpack(given))
-        pairs = map(self._unpack, self._unpack(given))
+            return self.vector_of(self._unpack(terms))
+        pairs = map(self._unpack, self._unpack(terms))
         parts = [self.mul(self.splat(factor), self.vector_of(self._unpack(of))) for factor, of in pairs]
         return reduce(self.add, parts)
 
-    def _unpack(self, given: Value) -> list[Value]:
-        return cgutils.unpack_tuple(self.builder, given)  # type: ignore[no-untyped-call]
+    def _unpack(self, values: Value) -> list[Value]:
+        return cgutils.unpack_tuple(self.builder, values)  # type: ignore[no-untyped-call]
 
     def vector_of(self, numbers: list[Value], kind: Any = None) -> Value:
         """A vector (of four numbers by default) that begins with these numbers; the rest is undefined."""

@@ -28,16 +28,16 @@ def _check(*arrays: Any) -> None:
         raise TypingError("contiguous arrays of two dimensions and one type are expected")
 
 
-def _without_result(write: Callable[[CodeBuilder], None], **given: Any) -> Any:
+def _without_result(write: Callable[[CodeBuilder], None], **kinds: Any) -> Any:
     """The signature and generator that numba expects of an operation without result, whose code ``write``
     builds.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        write(CodeBuilder(context, builder, signature, arguments, " ".join(given)))
+        write(CodeBuilder(context, builder, signature, arguments, " ".join(kinds)))
         return context.get_dummy_value()
 
-    return types.void(*given.values()), generate
+    return types.void(*kinds.values()), generate
 
 
 def _gather(typing: Any, blocks: Any, columns: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
@@ -61,8 +61,8 @@ def _gather(typing: Any, blocks: Any, columns: Any, x: Any, lo: Any, hi: Any, ah
                 builder.store(code.add(builder.load(sums[i]), code.mul(column, factor)), sums[i])
         one, two, three = map(builder.load, sums)
         total = code.add(code.add(one, two), three)
-        found = [builder.extract_element(total, LANE(i)) for i in range(3)]
-        return context.make_tuple(builder, signature.return_type, found)
+        numbers = [builder.extract_element(total, LANE(i)) for i in range(3)]
+        return context.make_tuple(builder, signature.return_type, numbers)
 
     three = types.UniTuple(blocks.dtype, 3)  # type: ignore[no-untyped-call]
     return three(blocks, columns, x, lo, hi, ahead), generate
@@ -113,8 +113,8 @@ def _gather_edges(typing: Any, blocks: Any, indices: Any, x: Any, lo: Any, hi: A
         ab = code.add(code.shuffle(a, b, 0, 1, 4, 5), code.shuffle(a, b, 2, 3, 6, 7))
         cc = code.add(c, code.shuffle(c, c, 2, 3, 2, 3))
         total = code.add(code.shuffle(ab, cc, 0, 2, 4, 4), code.shuffle(ab, cc, 1, 3, 5, 5))
-        found = [builder.extract_element(total, LANE(i)) for i in range(3)]
-        return context.make_tuple(builder, signature.return_type, found)
+        numbers = [builder.extract_element(total, LANE(i)) for i in range(3)]
+        return context.make_tuple(builder, signature.return_type, numbers)
 
     three = types.UniTuple(blocks.dtype, 3)  # type: ignore[no-untyped-call]
     return three(blocks, indices, x, lo, hi, ahead), generate

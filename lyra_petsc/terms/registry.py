@@ -99,9 +99,11 @@ def _has_clamped_hinges(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
 
 
 def _has_contact_friction(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
-    given = [obstacle.friction for obstacle in (scene.obstacles or {}).values()]
-    given = [] if scene.contact is None else [scene.contact.friction, *given]
-    return any(max(coefficients(each)) > 0.0 for each in given if each is not None)
+    if scene.contact is None:
+        return False
+    of_obstacles = [obstacle.friction for obstacle in (scene.obstacles or {}).values()]
+    frictions = [scene.contact.friction, *of_obstacles]
+    return any(max(coefficients(friction)) > 0.0 for friction in frictions if friction is not None)
 
 
 def _has_bending_friction(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:

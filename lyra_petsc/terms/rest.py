@@ -115,8 +115,8 @@ class RestShape:
 
     def _check_junctions(self) -> None:
         """Refuse edges of more than two triangles, for which a hinge's angle is undefined."""
-        bends, found = self.bends_with("hinge"), junctions(self.mesh.triangles)
-        wrong = [triangles for triangles in found if bends[triangles].any()]
+        bends = self.bends_with("hinge")
+        wrong = [triangles for triangles in junctions(self.mesh.triangles) if bends[triangles].any()]
         if wrong:
             edges = [self._edge_text(triangles) for triangles in wrong[:5]]
             more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""

@@ -137,7 +137,7 @@ def unit_notes(rest: RestShape) -> list[str]:
             "transform: {scale: 0.001}"
         )
     weighs = not scene.time.static or bool(scene.gravity and any(scene.gravity))
-    for number, (block, each) in enumerate(zip(scene.material, figures(rest), strict=True)):
-        if doubt := each.doubt(block, size, weighs=weighs):
+    for number, (block, figure) in enumerate(zip(scene.material, figures(rest), strict=True)):
+        if doubt := figure.doubt(block, size, weighs=weighs):
             notes.append(f"material[{number}]: {doubt}" if len(scene.material) > 1 else f"material: {doubt}")
     return notes

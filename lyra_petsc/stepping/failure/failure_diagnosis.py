@@ -117,7 +117,7 @@ def _trouble(solve: FailedSolve) -> str:
         return "linear trouble"
     # If Newton's method reached its limit of iterations, a last linear solve that failed is the cause only if
     # most of the earlier ones failed, too.
-    failed = [each.linear_reason < 0 for each in solve.iterations[1:]]
+    failed = [iteration.linear_reason < 0 for iteration in solve.iterations[1:]]
     rare = solve.snes_reason == SNES.DIVERGED_MAX_IT and 2 * sum(failed) < len(failed)
     return "nonlinear trouble" if solve.ksp_reason >= 0 or rare else "linear trouble"
 

@@ -115,7 +115,7 @@ class Failure:
     @property
     def lines(self) -> tuple[str, ...]:
         """Short lines with the iterations, the worst vertex, the nearest pair, and further advice."""
-        iterations = [_iteration_text(each) for each in self.failed_solve.iterations]
+        iterations = [_iteration_text(iteration) for iteration in self.failed_solve.iterations]
         earlier = [
             f"{one.dt:.3g}: {one.residual:.3g} ({one.newton_iterations})" for one in self.attempts[:-1]
         ]
@@ -135,16 +135,17 @@ class Failure:
         """The whole report, for a file."""
         rows = [self.sentence, "", "Attempts at this step:"]
         rows += [
-            f"  {self._length(each)} ({each.solver}): {each.newton_iterations} Newton and "
-            f"{each.linear_iterations} linear iterations, residual {each.residual:.3g} N: {each.words}"
-            for each in self.attempts
+            f"  {self._length(attempt)} ({attempt.solver}): {attempt.newton_iterations} Newton and "
+            f"{attempt.linear_iterations} linear iterations, residual {attempt.residual:.3g} N: "
+            f"{attempt.words}"
+            for attempt in self.attempts
         ]
         rows += ["", "The last attempt, Newton iteration by iteration:"]
         rows += [f"  {'it':>4}  {'residual [N]':>12}  {'linear its':>10}  {'KSP reason':>10}    fraction"]
-        for number, each in enumerate(self.failed_solve.iterations):
-            part = "" if each.taken is None else f"{each.taken:.3g}"
-            linear = f"{each.linear_iterations:10d}  {each.linear_reason:10d}"
-            rows += [f"  {number:4d}  {each.residual:12.5e}  {linear}  {part:>10}".rstrip()]
+        for number, iteration in enumerate(self.failed_solve.iterations):
+            part = "" if iteration.taken is None else f"{iteration.taken:.3g}"
+            linear = f"{iteration.linear_iterations:10d}  {iteration.linear_reason:10d}"
+            rows += [f"  {number:4d}  {iteration.residual:12.5e}  {linear}  {part:>10}".rstrip()]
         rows += ["", "Where (vertices are counted from 0, in file order):"]
         rows += [f"  {line}" for line in self._places()]
         rows += ["", "What to try:", *(f"  {change}" for change in self.advice)]
@@ -159,8 +160,8 @@ class Failure:
         return {
             "step": self.step,
             "load_factor" if self.static else "time": self.time,
-            "attempts": [asdict(each) for each in self.attempts],
-            "iterations": [asdict(each) for each in self.failed_solve.iterations],
+            "attempts": [asdict(attempt) for attempt in self.attempts],
+            "iterations": [asdict(iteration) for iteration in self.failed_solve.iterations],
             **asdict(self.diagnosis),
             **{name: asdict(pair) for name, pair in pairs.items() if pair is not None},
             "advice": self.advice,
@@ -293,10 +294,10 @@ def _pair_text(near: NearPair) -> str:
     return f"{near.text} {near.gap:.3g} m apart{beyond}"
 
 
-def _iteration_text(each: Iteration) -> str:
-    linear = f" ({each.linear_iterations})" if each.taken is not None else ""
-    part = f" ×{each.taken:.2g}" if each.taken is not None and each.taken < 0.995 else ""
-    return f"{each.residual:.3g}{linear}{part}"
+def _iteration_text(iteration: Iteration) -> str:
+    linear = f" ({iteration.linear_iterations})" if iteration.taken is not None else ""
+    part = f" ×{iteration.taken:.2g}" if iteration.taken is not None and iteration.taken < 0.995 else ""
+    return f"{iteration.residual:.3g}{linear}{part}"
 
 
 def _shortened(entries: list[str]) -> list[str]:

@@ -92,12 +92,12 @@ class BuckledShape:
         for _ in range(MAX_ITERATIONS):
             (before, force_before), (at, force) = one, other
             last, between = equations.x[:n].copy(), at - force * (at - before) / (force - force_before)
-            found = self._solve(start, mode, between * unit, abs(between - at))
-            if found is None:
+            holding = self._solve(start, mode, between * unit, abs(between - at))
+            if holding is None:
                 self._set_positions(last)
-            if found is None or abs(between - at) <= SAME * between:
+            if holding is None or abs(between - at) <= SAME * between:
                 break
-            one, other = other, (between, found)
+            one, other = other, (between, holding)
 
     def _solve(self, start: Array, mode: Array, goal: float, step: float) -> float | None:
         """Newton's method to an equilibrium with m · (x − start) = goal; returns the force μ [N], or None."""

@@ -173,6 +173,6 @@ def newton_displacement(
     ksp.setFromOptions()
     ksp.solve(b, u)
     displacement = solve(u.getArray(readonly=True).reshape(-1, 3))
-    for each in (ksp, b, u, matrix):
-        each.destroy()
+    for owned in (ksp, b, u, matrix):
+        owned.destroy()
     return displacement

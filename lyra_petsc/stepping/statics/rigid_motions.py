@@ -55,11 +55,11 @@ def _pieces(layout: Layout, triangles: NDArray[np.int32]) -> tuple[Ints, int]:
     while True:
         least = np.full(n, np.inf)
         np.minimum.at(least, part, label[:, 0])
-        found = np.broadcast_to(least[part][:, None], (n, 3)).copy()
-        layout.update_ghosts(found)
-        if not any(layout.global_max(float(np.any(found != label)))):
+        nearby = np.broadcast_to(least[part][:, None], (n, 3)).copy()
+        layout.update_ghosts(nearby)
+        if not any(layout.global_max(float(np.any(nearby != label)))):
             break
-        label = found
+        label = nearby
     vertex = layout.are_vertices(layout.global_number)
     known = np.unique(np.concatenate(layout.comm.allgather(np.unique(label[: layout.n_vertices, 0]))))
     return np.where(vertex, np.searchsorted(known, label[:, 0]), -1), len(known)

@@ -14,9 +14,6 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import MAX_SPEED, Handle, Keyframe, Rotation, Scene
 
-HALF_TURN = 180.0
-"""Angle [degrees] up to which interpolated quaternions rotate in the direction that the angle gives."""
-
 SAME_AXIS = 1e-12
 """Squared sine of the angle between two axes below which they count as the same."""
 
@@ -82,7 +79,7 @@ def _turn_angles(keyframes: Sequence[Keyframe], key: str, file: object) -> list[
             turns.append(angles[1] - angles[0])
         elif (along := float(one @ other)) ** 2 > 1.0 - SAME_AXIS:
             turns.append(math.copysign(1.0, along) * angles[1] - angles[0])
-        elif max(map(abs, angles)) > HALF_TURN:
+        elif max(map(abs, angles)) > 180.0:  # quaternions would turn the other way
             raise InputError(
                 f"keyframes {i} and {i + 1} turn about different axes, and one by more than 180°; give the "
                 "angle that leads there within 180°, or a keyframe with the same axis between them",
@@ -180,7 +177,7 @@ class Motion:
                 self._tangents[i, :3] = k.velocity
         self._rotations: list[tuple[Array, float, float, float]] | None = None
         same_axis = self._monotone and None not in turns and any(turns)
-        if same_axis or any(turn is not None and abs(turn) > HALF_TURN for turn in turns):
+        if same_axis or any(turn is not None and abs(turn) > 180.0 for turn in turns):
             self._set_rotations(keyframes, turns)
 
     def _set_rotations(self, keyframes: Sequence[Keyframe], turns: list[float | None]) -> None:
@@ -191,8 +188,8 @@ class Motion:
         for i, turn in enumerate(turns):
             axis, angle = _relative_rotation(self._values[i, 6:], self._values[i + 1, 6:])
             if turn is not None:
-                given = [each for each in map(_axis, keyframes[i : i + 2]) if each is not None]
-                axis, angle = given[0] if given else axis, math.radians(turn)
+                axes = [own for own in map(_axis, keyframes[i : i + 2]) if own is not None]
+                axis, angle = axes[0] if axes else axis, math.radians(turn)
             axes.append(axis)
             angles.append(angle)
         if not self._linear:
@@ -282,7 +279,7 @@ class Motion:
             return np.zeros_like(points)
         step = 1e-9 * float(np.diff(self._times).min())  # much shorter than steps in time
         a0, d0 = self.transform(start)
-        rates = [self._rate(each) for each in (time - step, time + step)]
+        rates = [self._rate(instant) for instant in (time - step, time + step)]
         a, d = (0.5 * (before + after) for before, after in zip(*rates, strict=True))
         return (points - d0) @ (a @ np.linalg.inv(a0)).T + d
 

@@ -94,8 +94,8 @@ def conflicts(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
 
 def has_edge_in(mesh: Mesh, vertices: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Whether both ends of an edge of each triangle, (n_triangles,), are among ``vertices``."""
-    found: NDArray[np.bool_] = np.isin(mesh.triangles, vertices).sum(axis=1) > 1
-    return found
+    two: NDArray[np.bool_] = np.isin(mesh.triangles, vertices).sum(axis=1) > 1
+    return two
 
 
 def clamps_without_edges(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:

@@ -74,11 +74,11 @@ def elements(rest: RestShape) -> Elements:
     keys, sign = low * n + high, np.where(ends[:, 0] < ends[:, 1], -1.0, 1.0)
     number = np.searchsorted(rest.edges[:, 0] * n + rest.edges[:, 1], keys)
     rows, moments, loads = [], [], []
-    for each, load in enumerate(scene.loads):
+    for index, load in enumerate(scene.loads):
         if load.moment is None:
             continue
         assert load.group is not None
-        key = f"loads[{each}]"
+        key = f"loads[{index}]"
         group = find_group(mesh, load.group, key=f"{key}.group", file=scene.source)
         if len(group.edges):
             wanted = np.unique(group.edges.min(axis=1) * n + group.edges.max(axis=1))
@@ -103,7 +103,7 @@ def elements(rest: RestShape) -> Elements:
             )
         rows.append(row)
         moments.append(load.moment * sign[row])
-        loads.append(np.full(len(row), float(each)))
+        loads.append(np.full(len(row), float(index)))
     row = np.concatenate(rows)
     data = {"moment": np.concatenate(moments), "load": np.concatenate(loads)}
     return Elements(np.column_stack([low[row], high[row]]), data, edges=number[row][:, None])

@@ -17,7 +17,7 @@ THRESHOLD = 0.75**2
 """λ₀²."""
 
 SMALLEST_SQUARE = 0.1**2
-"""λ² below which φ is extended as a parabola in λ²: strains predicted in Newton's method may have λ² < 0."""
+"""λ² below which laws are extended as polynomials: strains predicted in Newton's method may have λ² < 0."""
 
 STIFFNESS_RATIO = 0.25
 """Ratio of b to the largest stiffness at rest."""

@@ -21,9 +21,6 @@ from lyra_petsc.terms.membrane_laws import compression
 
 SOFTENS = False
 
-SMALLEST_SQUARE = 0.1**2
-"""λ² below which P/λ is extended linearly in E: strains predicted in Newton's method may have λ² < 0."""
-
 
 @kernel()
 def _evaluate_curve(x, c, m, which):  # type: ignore[no-untyped-def]
@@ -55,7 +52,7 @@ def _evaluate_curve(x, c, m, which):  # type: ignore[no-untyped-def]
 @kernel()
 def _axial(e, c, m, which):  # type: ignore[no-untyped-def]
     """Energy, P/λ and its derivative at the Green strain e along warp (0) or weft (1)."""
-    square = max(1.0 + 2.0 * e, SMALLEST_SQUARE)
+    square = max(1.0 + 2.0 * e, compression.SMALLEST_SQUARE)
     stretch = math.sqrt(square)
     # (λ² − 1)/(λ + 1) is λ − 1 without cancellation
     total, force, slope = _evaluate_curve((square - 1.0) / (stretch + 1.0), c, m, which)
