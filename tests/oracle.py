@@ -21,7 +21,7 @@ from lyra_petsc.terms.bending.midedge_shape import (
 from lyra_petsc.terms.loads.wind import Wind
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.stretch_limit import StretchLimit
-from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
+from lyra_petsc.terms.term import Assembly, Elastic, UpcomingStep, Viscous
 
 Ints = NDArray[np.int64] | NDArray[np.int32]
 
@@ -64,7 +64,7 @@ def hessian(
     term: Elastic | Viscous,
     at: Array,
     frozen: Any,
-    blend: float = 0.0,
+    convexity: float = 0.0,
     *,
     weight: Array | None = None,
     predicted: tuple[Array, Array] | None = None,
@@ -78,15 +78,15 @@ def hessian(
         term.add_hessian(at, frozen, pattern.offsets, values)
     else:
         weight = np.ones(term.n_elements) if weight is None else weight
-        term.add_hessian(at, frozen, blend, weight, pattern.offsets, values, predicted)
+        term.add_hessian(at, frozen, Assembly(weight, pattern.offsets, values, convexity, predicted))
     return expanded(pattern, values, n)
 
 
-def element_hessians(term: Elastic, x: Array, frozen: Any, blend: float = 0.0) -> Array:
+def element_hessians(term: Elastic, x: Array, frozen: Any, convexity: float = 0.0) -> Array:
     """Hessian of each element alone, (E, 3 n, 3 n) for all n points."""
     size = x.size
     return np.array(
-        [hessian(term, x, frozen, blend, weight=w).reshape(size, size) for w in np.eye(term.n_elements)]
+        [hessian(term, x, frozen, convexity, weight=w).reshape(size, size) for w in np.eye(term.n_elements)]
     )
 
 
@@ -114,7 +114,7 @@ def directors_along_normals(term: MidEdge, x: Array) -> Array:
 
 
 def membrane_blocks(
-    term: Membrane, x: Array, blend: float, predicted: tuple[Array, Array] | None = None
+    term: Membrane, x: Array, convexity: float, predicted: tuple[Array, Array] | None = None
 ) -> Array:
     """Element Hessians (E, 3, 3, 3, 3) of St. Venant-Kirchhoff membranes.
 
@@ -134,7 +134,7 @@ def membrane_blocks(
         green = 0.5 * (g.T @ g - np.eye(2) - change.T @ change)
         strain = np.array([green[0, 0], green[1, 1], 2.0 * green[0, 1]])
         extension = np.maximum(strain, 0.0) * [1.0, 1.0, 0.0]
-        s = (1.0 - blend) * (c @ strain) + blend * np.maximum(c @ extension, 0.0) * [1.0, 1.0, 0.0]
+        s = (1.0 - convexity) * (c @ strain) + convexity * np.maximum(c @ extension, 0.0) * [1.0, 1.0, 0.0]
         stress = np.array([[s[0], s[2]], [s[2], s[1]]])
         slopes = np.array(
             [
@@ -147,7 +147,7 @@ def membrane_blocks(
     return out
 
 
-def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
+def bending_blocks(term: Bending, x: Array, convexity: float) -> Array:
     """Element Hessians (E, 4, 4, 3, 3) of hinges, each computed from its four points."""
     sides = term._triangles.sides
     out, g = np.empty((term.n_elements, 4, 4, 3, 3)), np.empty((4, 3))
@@ -156,7 +156,7 @@ def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
     for e, points in enumerate(term.stencil):
         corners = [tuple(x[p].tolist()) for p in points]
         law = stiffness[e], rest[e], (limits[e, 0], limits[e, 1])
-        hinge_hessian(*corners, angles[e], *law, blend, g, out[e])
+        hinge_hessian(*corners, angles[e], *law, convexity, g, out[e])
     return out
 
 
@@ -205,14 +205,14 @@ def blocks_of(
     term: Elastic | Viscous,
     at: Array,
     frozen: Any,
-    blend: float = 0.0,
+    convexity: float = 0.0,
     predicted: tuple[Array, Array] | None = None,
 ) -> Array:
     """Element Hessians (E, k, k, 3, 3) by plain formulas, or by the term itself for single elements."""
     if isinstance(term, Membrane):
-        return membrane_blocks(term, at, blend, predicted)
+        return membrane_blocks(term, at, convexity, predicted)
     if isinstance(term, Bending):
-        return bending_blocks(term, at, blend)
+        return bending_blocks(term, at, convexity)
     if isinstance(term, StretchLimit):
         return stretch_limit_blocks(term, at)
     if isinstance(term, Wind):
@@ -220,5 +220,5 @@ def blocks_of(
     assert isinstance(term, Elastic)
     k = term.stencil.shape[1]
     out = np.full((term.n_elements, k, k, 3, 3), np.nan)
-    term.hessians(at, frozen, 0, term.n_elements, blend, out)
+    term.hessians(at, frozen, 0, term.n_elements, convexity, out)
     return out

@@ -28,10 +28,10 @@ from lyra_petsc.contact.pairs import NearPairs, no_near_pairs
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.position_cache import PositionCache, unwritable
 from lyra_petsc.terms.protocols import KEPT_FRACTION, LimitsStep
-from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Offsets, UpcomingStep
+from lyra_petsc.terms.term import Assembly, UpcomingStep
 
 TARGET_FRACTION = 0.7
 """Part of the gap at which pairs that become active in a Newton iteration shall be after it."""
@@ -184,7 +184,7 @@ class ContactBarrier(LimitsStep):
         self._scale = image_scale * narrowing
         self.gap /= self._scale
         self.pair_stiffness *= image_scale**2 * narrowing
-        self._remembered = Remembered(self._find_active)
+        self._active_at = PositionCache(self._find_active)
         self._expected = np.full(self.n_elements, np.nan)
         largest = np.append(np.abs(self.search.obstacle_x).max(axis=(0, 2)), 0.0)
         of_points = largest[np.where(self.points < 0, ~self.points, -1)]
@@ -221,7 +221,7 @@ class ContactBarrier(LimitsStep):
         """The pairs nearer than the gap for positions x (n_local, 3) [m] and obstacle_x (m, 3) [m]."""
         if not self.n_elements:
             return NO_PAIRS
-        return ActivePairs(*self._remembered(np.concatenate([x, obstacle_x])))
+        return ActivePairs(*self._active_at(np.concatenate([x, obstacle_x])))
 
     def _find_active(self, points: Array) -> tuple[NDArray[Any], ...]:
         x, obstacle_x = np.split(points, [len(points) - self.obstacles.n_points])
@@ -272,20 +272,11 @@ class ContactBarrier(LimitsStep):
                 out[self._springs.pair] = True
         return out
 
-    def add_hessian(
-        self,
-        x: Array,
-        frozen: ObstaclePositions,
-        blend: float,
-        weight: Array,
-        offsets: Mapping[str, Offsets],
-        values: Array,
-        predicted: tuple[Array, Array] | None = None,
-    ) -> None:
+    def add_hessian(self, x: Array, frozen: ObstaclePositions, into: Assembly) -> None:
         pair, pair_weight, beta, derivatives = self.active_pairs(x, frozen.stage).forces
-        active = pair, weight[pair] * pair_weight, beta, derivatives
-        own = offsets[self.name]
-        contact_pairs.add_hessians(x, frozen.stage, *self._pair_data, active, blend, own, values)
+        active = pair, into.weight[pair] * pair_weight, beta, derivatives
+        to = into.convexity, into.offsets[self.name], into.values
+        contact_pairs.add_hessians(x, frozen.stage, *self._pair_data, active, *to)
 
     def largest_stiffness(self, x: Array, frozen: ObstaclePositions) -> float:
         """Largest b″ [N/m] of an active pair times its weight on this rank."""

@@ -628,12 +628,12 @@ def add_gradient(x, x_obs, kind, points, offset, gap, stiffness, parallel, activ
 
 
 @leaf()
-def _mollify_hessian(p, beta, g, gap, delta, stiffness, force, blend, parallel, gradient, h):  # type: ignore[no-untyped-def]
+def _mollify_hessian(p, beta, g, gap, delta, stiffness, force, convexity, parallel, gradient, h):  # type: ignore[no-untyped-def]
     """Change the Hessian h (4, 4, 3, 3) of the energy of two edges to that of the mollified energy."""
     m, dm, ddm = _mollifier(p, parallel, gradient)
     if m == 1.0:
         return
-    energy, exact = (1.0 - blend) * stiffness * barrier(delta, gap)[0], (1.0 - blend) * dm * force
+    energy, exact = (1.0 - convexity) * stiffness * barrier(delta, gap)[0], (1.0 - convexity) * dm * force
     for i in range(4):
         for j in range(4):
             for k in range(3):
@@ -672,10 +672,12 @@ def _add_sine_hessian(p, factor, h):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def add_hessians(x, x_obs, kind, points, offset, gap, stiffness, parallel, active, blend, offsets, values):  # type: ignore[no-untyped-def]  # fmt: skip
+def add_hessians(  # type: ignore[no-untyped-def]
+    x, x_obs, kind, points, offset, gap, stiffness, parallel, active, convexity, offsets, values
+):
     """Add the Hessians [N/m] of active pairs to block rows values (n_blocks, 3, 3); no rows for obstacles.
 
-    ``active`` as in `add_gradient`, ``offsets`` (E, 10) as in `kernels.scatter`. ``blend`` 0 is exact, 1
+    ``active`` as in `add_gradient`, ``offsets`` (E, 10) as in `kernels.scatter`. ``convexity`` 0 is exact, 1
     keeps only b″ g gᵀ / |g|² (positive semidefinite).
     """
     p, across, gamma, e = np.empty((4, 3)), np.empty((4, 3)), np.empty((2, 4)), np.zeros((2, 3))
@@ -685,22 +687,23 @@ def add_hessians(x, x_obs, kind, points, offset, gap, stiffness, parallel, activ
         fetch_ahead(active[0][Index(min(n + AHEAD, len(active[0]) - 1))], offsets, blocks, 10, 0)
         _add_hessian(
             n, x, x_obs, kind, points, offset, gap, stiffness, parallel,
-            active, blend, offsets, capacity, values, blocks,
+            active, convexity, offsets, capacity, values, blocks,
         )  # fmt: skip
 
 
 @leaf()
 def _add_hessian(  # type: ignore[no-untyped-def]
-    n, x, x_obs, kind, points, offset, gap, stiffness, parallel, active, blend, offsets, work, values, blocks
+    n, x, x_obs, kind, points, offset, gap, stiffness, parallel,
+    active, convexity, offsets, work, values, blocks,
 ):  # fmt: skip
     """Add the Hessian of active pair n; ``work`` holds arrays for intermediate results."""
     at, weight, beta, derivatives = active
     pair, b, g = at[n], beta[n], derivatives[n]
-    factor = weight[n] if weight[n] > 0.0 else (1.0 - blend) * weight[n]
+    factor = weight[n] if weight[n] > 0.0 else (1.0 - convexity) * weight[n]
     if factor == 0.0 or not abs(g[3]) < np.inf:
         return
     p, across, gamma, e, h, sine_gradient = work
-    slope, is_edges = (1.0 - blend) * g[3], kind[pair] == EDGE_EDGE
+    slope, is_edges = (1.0 - convexity) * g[3], kind[pair] == EDGE_EDGE
     free = _free_coordinates(kind[pair], b, gamma) if slope != 0.0 else 0
     if free > 0 or is_edges:
         _load_points(x, x_obs, points, pair, p)
@@ -712,7 +715,7 @@ def _add_hessian(  # type: ignore[no-untyped-def]
         return
     _pair_hessian(g, b, slope, free, gamma, e, h)
     delta = math.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2) - offset[pair]
-    _mollify_hessian(p, b, g, gap[pair], delta, stiffness[pair], g[3], blend, parallel, sine_gradient, h)
+    _mollify_hessian(p, b, g, gap[pair], delta, stiffness[pair], g[3], convexity, parallel, sine_gradient, h)
     for i in range(4):
         if points[pair, i] < 0:
             h[i], h[:, i] = 0.0, 0.0

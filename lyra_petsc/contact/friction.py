@@ -40,7 +40,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms.protocols import Place, Stateful, TermState
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Offsets, UpcomingStep
+from lyra_petsc.terms.term import Assembly, UpcomingStep
 
 MAX_ELASTIC_SLIP = 0.01
 """Largest slip of a sticking pair over the gap. If the kinetic coefficient is below the static one, all pairs
@@ -475,20 +475,12 @@ class CoulombFriction(Stateful):
         if self.n_elements:
             friction_pairs.add_gradient(x, *self._data(frozen), out)
 
-    def add_hessian(
-        self,
-        x: Array,
-        frozen: ObstacleMotion,
-        blend: float,
-        weight: Array,
-        offsets: Mapping[str, Offsets],
-        values: Array,
-        predicted: tuple[Array, Array] | None = None,
-    ) -> None:
+    def add_hessian(self, x: Array, frozen: ObstacleMotion, into: Assembly) -> None:
         data = self._data(frozen)
         # the potential is convex; with a secant for sliding pairs equilibria would converge only linearly
-        blend = 0.0 if self._contact.static else blend
-        friction_pairs.add_hessians(x, *data, weight, blend, offsets[self.name], values)
+        convexity = 0.0 if self._contact.static else into.convexity
+        to = into.offsets[self.name], into.values
+        friction_pairs.add_hessians(x, *data, into.weight, convexity, *to)
 
     def count_sticking(self, x: Array, frozen: ObstacleMotion) -> tuple[float, float, float]:
         """Numbers of sticking and of sliding pairs of this rank at x (n_local, 3), and the sum of their

@@ -168,11 +168,11 @@ def add_gradient(x, stencil, gradients, constant, stiffness, limit, out):  # typ
 
 
 @kernel()
-def add_hessians(x, stencil, gradients, constant, stiffness, limit, weight, blend, offsets, values):  # type: ignore[no-untyped-def]  # fmt: skip
+def add_hessians(x, stencil, gradients, constant, stiffness, limit, weight, convexity, offsets, values):  # type: ignore[no-untyped-def]  # fmt: skip
     """Add weight (E,) times the Hessians [N/m], all positive semidefinite, to block rows values (n, 3, 3).
 
-    ``offsets`` (E, 10) as in `kernels.scatter`. ``blend`` 0 is exact; 1 replaces sliding by a spring of the
-    secant stiffness μ N / |u|, whose energy is an upper bound.
+    ``offsets`` (E, 10) as in `kernels.scatter`. ``convexity`` 0 is exact; 1 replaces sliding by a spring
+    of the secant stiffness μ N / |u|, whose energy is an upper bound.
     """
     blocks = values.reshape(-1, 9)
     for e in range(len(stencil)):
@@ -180,7 +180,7 @@ def add_hessians(x, stencil, gradients, constant, stiffness, limit, weight, blen
         u1, u2, norm = _slip(x, e, stencil, gradients, constant)
         sticks = stiffness[e] * norm <= limit[e]
         factor = weight[e] * (stiffness[e] if sticks else limit[e] / norm)
-        reduction = 0.0 if sticks else (1.0 - blend) * factor / (norm * norm)
+        reduction = 0.0 if sticks else (1.0 - convexity) * factor / (norm * norm)
         h11, h12, h22 = factor - reduction * u1 * u1, -reduction * u1 * u2, factor - reduction * u2 * u2
         for b in range(4):
             v, w = _gradient(gradients, e, 0, b), _gradient(gradients, e, 1, b)

@@ -14,7 +14,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.linear.block_product import make_product
 from lyra_petsc.linear.pattern import BlockPattern
-from lyra_petsc.terms.term import Elastic
+from lyra_petsc.terms.term import Assembly, Elastic
 
 
 @cached()
@@ -110,7 +110,7 @@ class BlockRows:
         term: Elastic,
         x: Array,
         frozen: Any,
-        blend: float,
+        convexity: float,
         weight: Array | float,
         values: Array,
         predicted: tuple[Array, Array] | None = None,
@@ -121,7 +121,7 @@ class BlockRows:
         weights = np.full(term.n_elements, weight) if isinstance(weight, float) else weight
         if not weights.flags.carray:  # kernels are compiled for contiguous arrays
             weights = weights.copy()
-        term.add_hessian(x, frozen, blend, weights, self.pattern.offsets, values, predicted)
+        term.add_hessian(x, frozen, Assembly(weights, self.pattern.offsets, values, convexity, predicted))
 
     def set_diagonal(self, diagonal: Array, values: Array) -> None:
         """Set ``values`` to ``diagonal`` (n_owned,) times the identity."""

@@ -183,12 +183,12 @@ class StageForces:
     # -- Jacobian ----------------------------------------------------------------------------------
 
     def jacobian(
-        self, at: Evaluation, blend: float, values: Array, predicted: tuple[Array, Array] | None = None
+        self, at: Evaluation, convexity: float, values: Array, predicted: tuple[Array, Array] | None = None
     ) -> Array | None:
         """Write σ M + c K + D + ∇∇P to block rows (n_blocks, 3, 3), prescribed unknowns decoupled.
 
-        ``blend`` is the weight of the regularised elastic Hessian: 0 takes the exact one. For ``predicted``
-        see `Elastic.add_hessian`; it may have other ghosts than the stage, but of contact only: those of
+        ``convexity`` is the weight of the regularised elastic Hessian: 0 takes the exact one. For
+        ``predicted`` see `Assembly`; it may have other ghosts than the stage, but of contact only: those of
         fixed stencils are the first. Returns the change (n_owned, 3) [N] of F by the motion of prescribed
         unknowns in steps of one linear solve, or None.
         """
@@ -198,16 +198,16 @@ class StageForces:
             inertia[len(inertia) - len(self._edge_stiffness) :] += reach * self._edge_stiffness
         constrained = self.constrained(step.prescribed)
         changing = constrained.changed
-        whole = step.linear and blend == 1.0
+        whole = step.linear and convexity == 1.0
         if not (whole and self._damping.assemble_with_stiffness(reach, inertia, values, changing)):
             self._damping.assemble(values, inertia)
             for term in self.active.elastic:
-                rows.add_stiffness(term, at.x, step.frozen[term], blend, reach, values, predicted)
+                rows.add_stiffness(term, at.x, step.frozen[term], convexity, reach, values, predicted)
         if not step.lagged:
             for wind in self.active.viscous:
                 wind.add_hessian(at.v, step.frozen[wind], rows.pattern.offsets, values)
-        if step.loads.following is not None and blend < 1.0:
-            step.loads.following.add_hessian((1.0 - blend) * reach, rows.pattern, values)
+        if step.loads.following is not None and convexity < 1.0:
+            step.loads.following.add_hessian((1.0 - convexity) * reach, rows.pattern, values)
         force = self._force_of_prescribed(step.prescribed, values) if step.linear else None
         if len(changing):
             rows.constrain(values, step.prescribed.mask, constrained)

@@ -27,8 +27,8 @@ from lyra_petsc.parallel import all_ranks_arrive
 from lyra_petsc.phases import RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.directors import update_frames
-from lyra_petsc.stepping.newton.blend import HessianBlend
 from lyra_petsc.stepping.newton.convergence import Convergence
+from lyra_petsc.stepping.newton.convexity import Convexity
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
 from lyra_petsc.stepping.newton.inexact import CAREFUL, COLLIDING, LOOSEST, TIGHTEST
 from lyra_petsc.stepping.newton.initial_guess import first_guess
@@ -73,7 +73,7 @@ class StageSolver:
         Norm [N] of the residual's round-off.
     candidates : sequence of str
         The linear solver, and those to try next.
-    blend : HessianBlend
+    convexity : Convexity
     extrapolation : Extrapolation
         Of the velocities, where a step is one linear solve.
 
@@ -107,7 +107,7 @@ class StageSolver:
         spacing: float,
         floor: float,
         candidates: Sequence[str],
-        blend: HessianBlend,
+        convexity: Convexity,
         extrapolation: Extrapolation,
     ) -> None:
         self._equations, self._extrapolation, self._candidates = equations, extrapolation, candidates
@@ -131,7 +131,7 @@ class StageSolver:
             self.snes,
             equations,
             self.linear,
-            blend,
+            convexity,
             self.convergence,
             self._points,
             iterates=self._iterates,

@@ -20,7 +20,7 @@ from lyra_petsc.stepping import edge_solve
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.directors import turn_with_triangles, update_frames
 from lyra_petsc.stepping.edge_solve import EdgeSolve
-from lyra_petsc.stepping.newton.blend import HessianBlend
+from lyra_petsc.stepping.newton.convexity import Convexity
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
 from lyra_petsc.stepping.newton.force_scales import expected_iterations
 from lyra_petsc.stepping.newton.initial_guess import has_start
@@ -131,7 +131,7 @@ class Stepper:
     def _take_integrator(self, candidates: list[str]) -> None:
         """Solve with the first of these for Newton's method, or for one linear solve."""
         self._iterates, self.presets = self._equations.integrator.iterates, candidates
-        self._blend = HessianBlend(self._scene.solver.hessian if self._iterates else "regularised")
+        self._convexity = Convexity(self._scene.solver.hessian if self._iterates else "regularised")
         self._create_solver()
 
     def _create_solver(self) -> None:
@@ -142,7 +142,7 @@ class Stepper:
             spacing=self._spacing,
             floor=self._floor,
             candidates=tuple(self.presets),
-            blend=self._blend,
+            convexity=self._convexity,
             extrapolation=self._extrapolation,
         )
         self.our_options += [name for name in self.solver.filled if name not in self.our_options]

@@ -37,14 +37,14 @@ class FrictionLimits(NamedTuple):
         k = 0.5 * self.limit / np.where(sticks, self.yield_strain, c)
         return k, np.copysign(c, u)
 
-    def tangent(self, u: Array, blend: float) -> tuple[Array, Array]:
-        """k and c (E,) such that 2 k c is the force at u and 2 k the second derivative, mixed with ``blend``
-        times 2 k of `parabola`.
+    def tangent(self, u: Array, convexity: float) -> tuple[Array, Array]:
+        """k and c (E,) such that 2 k c is the force at u and 2 k the second derivative, mixed with
+        ``convexity`` times 2 k of `parabola`.
         """
         k, c = self.parabola(u)
         force = 2.0 * k * c
         exact = np.where(np.abs(u) <= self.yield_strain, k, MIN_STIFFNESS * self.limit / self.yield_strain)
-        mixed = (1.0 - blend) * exact + blend * k
+        mixed = (1.0 - convexity) * exact + convexity * k
         return mixed, 0.5 * force / mixed
 
     def slid(self, u: Array) -> Array:

@@ -10,7 +10,7 @@ stress in the Hessian: Magisano, Leonetti & Garcea, Comput. Meth. Appl. Mech. En
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import zip_longest
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ from lyra_petsc.scene.materials.library import ShellMaterial, resolve_material
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.membrane_laws import law_of
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Offsets
+from lyra_petsc.terms.term import Assembly, Elastic
 
 Stencil = NDArray[np.int32]
 
@@ -142,7 +142,7 @@ def kernels_of(law: str) -> Kernels:
 
     @kernel()
     def add_hessian(  # type: ignore[no-untyped-def]
-        x, y, z, linearised, s, blend, inverse, area, c, law, weight, offsets, values
+        x, y, z, linearised, s, convexity, inverse, area, c, law, weight, offsets, values
     ):
         """Add weight (E,) times the Hessian blocks [N/m] to block rows at ``offsets`` (E, 6).
 
@@ -161,12 +161,12 @@ def kernels_of(law: str) -> Kernels:
                 e0, e1, e2 = _green(f)
             s0, s1, s2 = stress(e0, e1, e2, c, m)
             c11, c12, c22, c33, c13, c23 = tangent(e0, e1, e2, c, m)
-            if blend > 0.0:
+            if convexity > 0.0:
                 p0, p1, _ = stress(max(e0, 0.0), max(e1, 0.0), 0.0, c, m)
                 s0, s1, s2 = (
-                    s0 + blend * (max(p0, 0.0) - s0),
-                    s1 + blend * (max(p1, 0.0) - s1),
-                    s2 - blend * s2,
+                    s0 + convexity * (max(p0, 0.0) - s0),
+                    s1 + convexity * (max(p1, 0.0) - s1),
+                    s2 - convexity * s2,
                 )
             t = w * s0, w * s1, w * s2
             stiff = w * c11, w * c12, w * c22, w * c33, w * c13, w * c23
@@ -221,21 +221,11 @@ class Membrane(Elastic):
     def add_gradient(self, x: Array, frozen: Any, out: Array) -> None:
         self._kernels.add_gradient(x, self.stencil, self._inverse, self._area, *self.laws, out)
 
-    def add_hessian(
-        self,
-        x: Array,
-        frozen: Any,
-        blend: float,
-        weight: Array,
-        offsets: Mapping[str, Offsets],
-        values: Array,
-        predicted: tuple[Array, Array] | None = None,
-    ) -> None:
-        positions, linearised = (x, *(predicted or (x, x))), predicted is not None
+    def add_hessian(self, x: Array, frozen: Any, into: Assembly) -> None:
+        positions, linearised = (x, *(into.predicted or (x, x))), into.predicted is not None
         constants = self._inverse, self._area, *self.laws
-        self._kernels.add_hessian(
-            *positions, linearised, self.stencil, blend, *constants, weight, offsets[self.name], values
-        )
+        law, to = (into.convexity, *constants), (into.weight, into.offsets[self.name], into.values)
+        self._kernels.add_hessian(*positions, linearised, self.stencil, *law, *to)
 
     def force_scale(self, size: float) -> Array:
         parameters, law = self.laws

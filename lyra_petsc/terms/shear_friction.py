@@ -62,14 +62,14 @@ class ShearFriction(Dissipates):
         for i in range(3):
             out[:, i] += np.bincount(self.stencil.ravel(), pull[:, :, i].ravel(), len(out))
 
-    def hessians(self, x: Array, frozen: Any, lo: int, hi: int, blend: float, out: Array) -> None:
+    def hessians(self, x: Array, frozen: Any, lo: int, hi: int, convexity: float, out: Array) -> None:
         rows = slice(lo, hi)
         shear, slope = self._shear(x, rows)
         friction = FrictionLimits(*(values[rows] for values in self._friction))
-        k, change = friction.tangent(shear - self.sheared[rows], blend)
+        k, change = friction.tangent(shear - self.sheared[rows], convexity)
         u, v = self._shape[rows, :, 0], self._shape[rows, :, 1]
         np.einsum("e,eai,ebj->eabij", 2.0 * k, slope, slope, out=out)
-        bent = (1.0 - blend) * 2.0 * k * change
+        bent = (1.0 - convexity) * 2.0 * k * change
         turned = np.einsum("e,ea,eb->eab", bent, u, v)
         out += (turned + turned.transpose(0, 2, 1))[..., None, None] * np.eye(3)
 

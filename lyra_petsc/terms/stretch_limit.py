@@ -15,7 +15,6 @@ of singular values B. Smith, F. de Goes & T. Kim, ACM TOG 38 (2019) 3.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +25,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.protocols import KEPT_FRACTION, LimitsStep
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.stretch import principal_stretches
-from lyra_petsc.terms.term import Offsets
+from lyra_petsc.terms.term import Assembly
 
 SECANTS = 12
 """Secants by which the fraction of a displacement is found that the bound of a triangle allows."""
@@ -94,8 +93,8 @@ class StretchLimit(LimitsStep):
         out, at = np.zeros(self.n_owned), self._stretched(x, self.n_owned)
         scale = self._area[at.rows] * self._stiffness[at.rows] * self._width[at.rows] ** 2
         with np.errstate(divide="ignore"):
-            each = np.where(at.part > 0.0, (1.0 - at.part) ** 3 / at.part, np.inf)
-        out[at.rows] = scale * each.sum(axis=1)
+            barrier = np.where(at.part > 0.0, (1.0 - at.part) ** 3 / at.part, np.inf)
+        out[at.rows] = scale * barrier.sum(axis=1)
         return out
 
     def _slopes(self, at: Stretched) -> Array:
@@ -110,16 +109,7 @@ class StretchLimit(LimitsStep):
         with np.errstate(invalid="ignore"):  # beyond the limit there is no force
             np.add.at(out, self.stencil[at.rows], np.einsum("ek,eck,eik->eci", pull, at.along, at.direction))
 
-    def add_hessian(
-        self,
-        x: Array,
-        frozen: Any,
-        blend: float,
-        weight: Array,
-        offsets: Mapping[str, Offsets],
-        values: Array,
-        predicted: tuple[Array, Array] | None = None,
-    ) -> None:
+    def add_hessian(self, x: Array, frozen: Any, into: Assembly) -> None:
         at = self._stretched(x)
         area, k = self._area[at.rows], self._stiffness[at.rows]
         (p, q), (t, r) = self._slopes(at).T, at.part.T
@@ -146,7 +136,7 @@ class StretchLimit(LimitsStep):
             along = at.along[lo:hi]
             np.einsum("eak,ebl,eklij->eabij", along, along, stiff[lo:hi], out=blocks)
 
-        self._add_hessians(fill, weight[at.rows], offsets, values, at.rows)
+        self._add_hessians(fill, into, at.rows)
 
     def force_scale(self, size: float) -> Array:
         return self._stiffness * self._area * np.abs(self._inverse).max(axis=(1, 2)) ** 2 * size

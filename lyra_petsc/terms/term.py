@@ -85,6 +85,30 @@ class UpcomingStep:
     reference: Callable[[float, Ints], Array]
 
 
+class Assembly(NamedTuple):
+    """Block rows to which the Hessians of a term's elements are added, and which Hessians.
+
+    Attributes
+    ----------
+    weight : (E,)
+        Factor of each element's Hessian.
+    offsets : mapping of str to array
+        Those of a `BlockPattern`, by the names of ``couplings``.
+    values : (n_blocks, 3, 3)
+        The block rows.
+    convexity : float
+        Weight of the regularised, positive-semidefinite Hessian, beside the exact one.
+    predicted : two arrays (n_local, 3), or None
+        Positions y and z: an exact Hessian may use the stress of the strain at z linearised at y.
+    """
+
+    weight: Array
+    offsets: Mapping[str, Offsets]
+    values: Array
+    convexity: float = 0.0
+    predicted: tuple[Array, Array] | None = None
+
+
 class Term(ABC):
     """A sum over elements. Its registration describes its role in the rest of the program.
 
@@ -130,16 +154,11 @@ class Term(ABC):
     def _add_hessians(
         self,
         fill: Callable[[int, int, Array], None],
-        weight: Array,
-        offsets: Mapping[str, Offsets],
-        values: Array,
+        into: Assembly,
         rows: Ints | slice = slice(None),
     ) -> None:
-        """Add the Hessians of elements ``rows``, times ``weight`` of each, to block rows (n_blocks, 3, 3).
-
-        ``fill(lo, hi, out)`` computes those of the lo-th to hi-th of them.
-        """
-        at, stencil = offsets[self.name][rows], self.stencil[rows]
+        """Add the Hessians of elements ``rows``; ``fill(lo, hi, out)`` writes those of the lo-th to hi-th."""
+        at, weight, stencil = into.offsets[self.name][rows], into.weight[rows], self.stencil[rows]
         n = stencil.shape[1]
         m = 0 if self.edges is None else self.edges.shape[1]
         shape = (n, n, 3, 3) if self.edges is None else (3 * n + m, 3 * n + m)
@@ -150,10 +169,10 @@ class Term(ABC):
             blocks = buffer[: hi - lo]
             fill(lo, hi, blocks)
             if self.edges is None:
-                add_elements(weight[lo:hi], blocks, at[lo:hi], values)
+                add_elements(weight[lo:hi], blocks, at[lo:hi], into.values)
             else:
-                corners = offsets[f"{self.name} vertices"][rows][lo:hi]
-                add_mixed_elements(weight[lo:hi], blocks, n, corners, at[lo:hi], values)
+                corners = into.offsets[f"{self.name} vertices"][rows][lo:hi]
+                add_mixed_elements(weight[lo:hi], blocks, n, corners, at[lo:hi], into.values)
 
 
 class Elastic(Term):
@@ -170,33 +189,18 @@ class Elastic(Term):
     def add_gradient(self, x: Array, frozen: Any, out: Array) -> None:
         """Add the gradient [N] to ``out`` (n_local, 3)."""
 
-    def hessians(self, x: Array, frozen: Any, lo: int, hi: int, blend: float, out: Array) -> None:
+    def hessians(self, x: Array, frozen: Any, lo: int, hi: int, convexity: float, out: Array) -> None:
         """Write the Hessians [N/m] of elements lo..hi into ``out``; unused if ``add_hessian`` is overridden.
 
-        ``blend`` 0 gives the exact Hessian, 1 the regularised, positive-semidefinite one, values between them
-        the linear combination. ``out`` has shape (hi − lo, n, n, 3, 3); with edge unknowns
+        ``convexity`` 0 gives the exact Hessian, 1 the regularised, positive-semidefinite one, values between
+        them the linear combination. ``out`` has shape (hi − lo, n, n, 3, 3); with edge unknowns
         (hi − lo, 3 n + m, 3 n + m), the coordinates of the vertices before the unknowns of the edges.
         """
         raise NotImplementedError
 
-    def add_hessian(
-        self,
-        x: Array,
-        frozen: Any,
-        blend: float,
-        weight: Array,
-        offsets: Mapping[str, Offsets],
-        values: Array,
-        predicted: tuple[Array, Array] | None = None,
-    ) -> None:
-        """Add weight (E,) × element Hessians [N/m] to block rows (n_blocks, 3, 3).
-
-        ``offsets`` are those of a `BlockPattern`, by the names of ``couplings``. With ``predicted`` positions
-        y and z (n_local, 3) an exact Hessian may use the stress of the strain at z linearised at y.
-        """
-        self._add_hessians(
-            lambda lo, hi, out: self.hessians(x, frozen, lo, hi, blend, out), weight, offsets, values
-        )
+    def add_hessian(self, x: Array, frozen: Any, into: Assembly) -> None:
+        """Add the element Hessians [N/m] to block rows."""
+        self._add_hessians(lambda lo, hi, out: self.hessians(x, frozen, lo, hi, into.convexity, out), into)
 
     @abstractmethod
     def force_scale(self, size: float) -> Array:

@@ -18,7 +18,7 @@ from lyra_petsc.contact.contact_pairs import (
     VERTEX_PLANE,
     VERTEX_TRIANGLE,
 )
-from lyra_petsc.terms.remembered import unwritable
+from lyra_petsc.terms.position_cache import unwritable
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -86,10 +86,10 @@ class Pairs:
         contact_pairs.add_gradient(x, self.obstacle_x, *of, active, out, obstacle_gradient)
         return out, obstacle_gradient
 
-    def hessians(self, parallel: float = NOWHERE, blend: float = 0.0) -> Array:
+    def hessians(self, parallel: float = NOWHERE, convexity: float = 0.0) -> Array:
         """Hessians (n, 12, 12) of the pairs."""
         of, active = self._active(self.x, parallel)
-        each = blocks_of(self.x, self.obstacle_x, of, active, blend)
+        each = blocks_of(self.x, self.obstacle_x, of, active, convexity)
         return each.transpose(0, 1, 3, 2, 4).reshape(-1, 12, 12)
 
     def largest_step(self, dx: Array, obstacle_dx: Array, e: int | None = None, most: float = 1.0) -> float:
@@ -103,7 +103,7 @@ ACTIVE_COLUMNS = ["at", "weight", "beta", "derivatives"]
 
 
 def blocks_of(
-    x: Array, obstacle_x: Array, of: tuple[Any, ...], active: tuple[Any, ...], blend: float
+    x: Array, obstacle_x: Array, of: tuple[Any, ...], active: tuple[Any, ...], convexity: float
 ) -> Array:
     """Hessians (n, 4, 4, 3, 3) of pairs, as the kernel adds them to blocks; every other block is added
     transposed.
@@ -113,7 +113,7 @@ def blocks_of(
     turned = number % 2
     values, out = np.zeros((10 * n, 3, 3)), np.empty((n, 4, 4, 3, 3))
     (at, weight, *rest), places = active, 2 * number + turned
-    contact_pairs.add_hessians(x, obstacle_x, *of, (at, 1.0 * weight, *rest), blend, places, values)
+    contact_pairs.add_hessians(x, obstacle_x, *of, (at, 1.0 * weight, *rest), convexity, places, values)
     values = values.reshape(n, 10, 3, 3)
     values = np.where(turned[:, :, None, None] == 1, values.transpose(0, 1, 3, 2), values)
     out[:, one, other], out[:, other, one] = values, values.transpose(0, 1, 3, 2)
@@ -121,7 +121,7 @@ def blocks_of(
 
 
 def found_active(*given: Any, counted: int, capacity: int | None = None) -> dict[str, NDArray[Any]]:
-    """The results of `contact_pairs.find_active` by name, read-only as from `Remembered`."""
+    """The results of `contact_pairs.find_active` by name, read-only as from `PositionCache`."""
     n = len(given[2])
     capacity = n if capacity is None else capacity
     least, found = np.empty(n), {"at": np.empty(capacity, dtype=np.int64), "weight": np.empty(capacity)}
@@ -262,13 +262,13 @@ def test_derivatives(name: str) -> None:
 def test_regularised_hessians_are_positive_semidefinite(name: str) -> None:
     make, parallel = KINDS[name]
     pairs = make()
-    exact, regular = pairs.hessians(parallel), pairs.hessians(parallel, blend=1.0)
+    exact, regular = pairs.hessians(parallel), pairs.hessians(parallel, convexity=1.0)
     for h in (exact, regular):
         np.testing.assert_allclose(h, h.transpose(0, 2, 1), atol=1e-11 * np.abs(h).max())
     least, most = np.linalg.eigvalsh(regular)[:, [0, -1]].T
     assert (least >= -1e-12 * most - 1e-300).all()
     assert (most > 0.0).sum() > 0.4 * len(pairs)
-    mixed = pairs.hessians(parallel, blend=0.25)
+    mixed = pairs.hessians(parallel, convexity=0.25)
     if parallel == NOWHERE:
         np.testing.assert_allclose(mixed, 0.75 * exact + 0.25 * regular, atol=1e-11 * np.abs(exact).max())
 

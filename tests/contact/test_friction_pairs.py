@@ -87,9 +87,9 @@ def gradient(x: Array, state: tuple[Array, ...]) -> Array:
     return out
 
 
-def hessians(x: Array, state: tuple[Array, ...], blend: float) -> Array:
+def hessians(x: Array, state: tuple[Array, ...], convexity: float) -> Array:
     values, offsets = np.zeros((10 * N, 3, 3)), 2 * np.arange(10 * N).reshape(N, 10)
-    friction_pairs.add_hessians(x, *state, np.ones(N), blend, offsets, values)
+    friction_pairs.add_hessians(x, *state, np.ones(N), convexity, offsets, values)
     out = np.empty((N, 4, 4, 3, 3))
     for a, b, block in zip(*np.triu_indices(4), values.reshape(N, 10, 3, 3).swapaxes(0, 1), strict=True):
         out[:, a, b], out[:, b, a] = block, block.swapaxes(1, 2)

@@ -57,9 +57,11 @@ def residual(simulation: Simulation, v: Array) -> Array:
     return simulation.equations.residual_at(v)
 
 
-def jacobian(simulation: Simulation, v: Array, blend: float) -> Array:
+def jacobian(simulation: Simulation, v: Array, convexity: float) -> Array:
     equations = simulation.equations
-    equations.forces.jacobian(equations.linearised(v), blend, values := equations.discretisation.rows.zeros())
+    equations.forces.jacobian(
+        equations.linearised(v), convexity, values := equations.discretisation.rows.zeros()
+    )
     return values
 
 
@@ -150,8 +152,8 @@ def test_residual_is_the_gradient_of_the_objective(comm: MPI.Comm) -> None:
         assert slope == pytest.approx(numeric, rel=1e-8)
 
 
-@pytest.mark.parametrize("blend", [0.0, 0.5])
-def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, blend: float) -> None:
+@pytest.mark.parametrize("convexity", [0.0, 0.5])
+def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, convexity: float) -> None:
     with Simulation(EVERYTHING, comm) as simulation:
         bent_state(simulation)
         equations = simulation.equations
@@ -165,8 +167,8 @@ def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, blend: float) -
                 y, z = x + 0.01 * np.cos(9.0 * x[:, ::-1]), x + 0.01 * np.sin(7.0 * x)
                 cases += [(y, x), (y, y), (y, z)]
             for predicted in cases:
-                rows.add_stiffness(term, x, frozen, blend, weight, values := rows.zeros(), predicted)
-                blocks = weight[:, None, None, None, None] * blocks_of(term, x, frozen, blend, predicted)
+                rows.add_stiffness(term, x, frozen, convexity, weight, values := rows.zeros(), predicted)
+                blocks = weight[:, None, None, None, None] * blocks_of(term, x, frozen, convexity, predicted)
                 expected = summed(term.stencil, blocks, len(x))[:n]
                 atol = 1e-13 * np.abs(blocks).max(initial=1.0)
                 np.testing.assert_allclose(

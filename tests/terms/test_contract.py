@@ -89,7 +89,7 @@ def disturbed(simulation: Simulation, size: float, squeeze: float = 1.0) -> Arra
 
 def turned(frozen: Any, turn: Array) -> Any:
     """The frozen data of a term, rotated with the shape."""
-    return Frames(*(each @ turn.T for each in frozen)) if isinstance(frozen, Frames) else frozen
+    return Frames(*(vectors @ turn.T for vectors in frozen.vectors)) if isinstance(frozen, Frames) else frozen
 
 
 def test_every_registered_term_has_an_example_and_a_kind() -> None:
@@ -147,13 +147,13 @@ def test_exact_hessian_is_the_derivative_of_the_gradient(
 
 
 @pytest.mark.parametrize("name", ["membrane", "bending"])
-@pytest.mark.parametrize("blend", [0.3, 1.0])
+@pytest.mark.parametrize("convexity", [0.3, 1.0])
 def test_hessian_is_that_of_a_plain_formula(
-    elastic: Elastic, frozen: Any, simulation: Simulation, blend: float
+    elastic: Elastic, frozen: Any, simulation: Simulation, convexity: float
 ) -> None:
     y = disturbed(simulation, 0.15)
-    found = hessian(elastic, y, frozen, blend)
-    plain = summed(elastic.stencil, blocks_of(elastic, y, frozen, blend), len(y))
+    found = hessian(elastic, y, frozen, convexity)
+    plain = summed(elastic.stencil, blocks_of(elastic, y, frozen, convexity), len(y))
     np.testing.assert_allclose(found, plain, rtol=0.0, atol=1e-12 * np.abs(plain).max())
 
 
@@ -163,15 +163,15 @@ def test_regularised_hessian_is_positive_semidefinite(
     elastic: Elastic, frozen: Any, simulation: Simulation, squeeze: float
 ) -> None:
     y = disturbed(simulation, 0.1, squeeze)
-    for blend in (0.0, 0.3, 1.0):
-        matrices = element_hessians(elastic, y, frozen, blend)
+    for convexity in (0.0, 0.3, 1.0):
+        matrices = element_hessians(elastic, y, frozen, convexity)
         largest = np.abs(matrices).max()
         np.testing.assert_allclose(matrices, matrices.transpose(0, 2, 1), rtol=0.0, atol=1e-13 * largest)
     assert np.linalg.eigvalsh(matrices).min() >= -1e-12 * largest
 
 
 def test_exact_hessian_of_a_compressed_sheet_is_indefinite(tmp_path: Path) -> None:
-    # otherwise the test above would hold without the regularisation
+    # otherwise the test above would hold without the convexity
     with example("membrane", tmp_path) as simulation:
         term = simulation.problem.membrane
         matrices = element_hessians(term, 0.4 * simulation.equations.x, None, 0.0)
@@ -179,9 +179,9 @@ def test_exact_hessian_of_a_compressed_sheet_is_indefinite(tmp_path: Path) -> No
 
 
 @every_elastic
-def test_blend_is_the_mixture_of_both(elastic: Elastic, frozen: Any, simulation: Simulation) -> None:
+def test_regularisation_is_the_mixture_of_both(elastic: Elastic, frozen: Any, simulation: Simulation) -> None:
     y = disturbed(simulation, 0.1, 0.8)
-    exact, regularised, mixed = (element_hessians(elastic, y, frozen, blend) for blend in (0.0, 1.0, 0.3))
+    exact, regularised, mixed = (element_hessians(elastic, y, frozen, part) for part in (0.0, 1.0, 0.3))
     np.testing.assert_allclose(mixed, 0.7 * exact + 0.3 * regularised, atol=1e-12 * np.abs(exact).max())
 
 

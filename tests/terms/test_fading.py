@@ -90,10 +90,10 @@ def gradient(term: Elastic, x: Array, start: Array | None = None) -> Array:
     return gradient_of(term, x, frozen(term, start))
 
 
-def hessian(term: Elastic, x: Array, blend: float = 0.0, start: Array | None = None) -> Array:
+def hessian(term: Elastic, x: Array, convexity: float = 0.0, start: Array | None = None) -> Array:
     """Hessian (3 n, 3 n) of the single element."""
     n = 3 * term.stencil.shape[1]
-    whole = hessian_of(term, x, frozen(term, start), blend).reshape(x.size, x.size)
+    whole = hessian_of(term, x, frozen(term, start), convexity).reshape(x.size, x.size)
     assert not whole[n:].any()
     assert not whole[:, n:].any()
     return whole[:n, :n]
@@ -145,7 +145,7 @@ def test_regularised_hessian_of_a_fading_hinge(
     make: Callable[[], Elastic], left: tuple[float, float]
 ) -> None:
     term, x = make(), hinge(*left)
-    exact, regularised, mixed = (hessian(term, x, blend) for blend in (0.0, 1.0, 0.3))
+    exact, regularised, mixed = (hessian(term, x, convexity) for convexity in (0.0, 1.0, 0.3))
     np.testing.assert_allclose(mixed, 0.7 * exact + 0.3 * regularised, atol=1e-12 * np.abs(exact).max())
     values = np.linalg.eigvalsh(regularised)
     assert values[0] >= -1e-12 * values[-1]
@@ -198,8 +198,8 @@ def test_a_triangle_without_area_has_no_energy_and_no_force(make: Callable[[], E
     term, x = make(), flattened()[shape]
     assert total(term)(x) == 0.0
     assert not gradient(term, x).any()
-    for blend in (0.0, 0.5, 1.0):
-        assert not hessian(term, x, blend).any()
+    for convexity in (0.0, 0.5, 1.0):
+        assert not hessian(term, x, convexity).any()
     if isinstance(term, Bending):
         assert np.isfinite(term.angles(x)).all()
         assert term.weights(x)[0] == 0.0

@@ -12,6 +12,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.terms.bending.hinge import Bending
 from lyra_petsc.terms.registry import registration_of
+from lyra_petsc.terms.term import Assembly
 
 
 def strip(n: int, *, twisted: bool) -> Ints:
@@ -117,16 +118,16 @@ def test_sums_over_triangles_are_sums_over_hinges(name: str, limit: float) -> No
 
 @every_sheet
 @pytest.mark.parametrize("limit", [0.0, 0.3])
-@pytest.mark.parametrize(("blend", "n_owned"), [(0.0, 14), (0.4, 5)])
+@pytest.mark.parametrize(("convexity", "n_owned"), [(0.0, 14), (0.4, 5)])
 def test_block_rows_are_those_of_the_element_hessians(
-    name: str, limit: float, blend: float, n_owned: int
+    name: str, limit: float, convexity: float, n_owned: int
 ) -> None:
     term, x = bending(name, limit), shape(14)
     pattern = BlockPattern(term.couplings, n_owned, 14)
     values = np.zeros((pattern.n_blocks, 3, 3))
     weight = 1.0 + np.arange(term.n_elements)
-    term.add_hessian(x, None, blend, weight, pattern.offsets, values)
-    blocks = weight[:, None, None, None, None] * bending_blocks(term, x, blend)
+    term.add_hessian(x, None, Assembly(weight, pattern.offsets, values, convexity))
+    blocks = weight[:, None, None, None, None] * bending_blocks(term, x, convexity)
     expected = summed(term.stencil, blocks, 14)[:n_owned]
     assert expected.any() == bool(term.n_elements)
     np.testing.assert_allclose(
@@ -148,8 +149,8 @@ def test_coincident_points_give_finite_results() -> None:
     x[stencil[0, 1]] = x[stencil[0, 0]]
     pattern = BlockPattern(term.couplings, 14, 14)
     values = np.zeros((pattern.n_blocks, 3, 3))
-    for blend in (0.0, 1.0):
-        term.add_hessian(x, None, blend, np.ones(len(stencil)), pattern.offsets, values)
+    for convexity in (0.0, 1.0):
+        term.add_hessian(x, None, Assembly(np.ones(len(stencil)), pattern.offsets, values, convexity))
     assert np.isfinite(term.energies(x)).all()
     assert np.isfinite(gradient(term, x, None)).all()
     assert np.isfinite(values).all()

@@ -72,7 +72,7 @@ def cylinder(pattern: str, n: int) -> float:
         flat, edges = x[rows].copy(), term.of_edges
         x[rows] = np.column_stack([np.sin(flat[:, 0]), flat[:, 1], 1.0 - np.cos(flat[:, 0])])
         term.initialise(x)
-        tangent, across = term.frames
+        tangent, across = term.frames.vectors
         middle = flat[edges.ends].mean(axis=1)[:, 0]
         normal = np.column_stack([-np.sin(middle), np.zeros(len(middle)), np.cos(middle)])
         sine = np.sum(np.cross(tangent, across) * normal, axis=1)

@@ -64,7 +64,7 @@ def test_regularisation_keeps_the_stress_of_extension_along_the_material_axes(
         membrane = simulation.problem.membrane
         x = simulation.equations.x.copy()
         x[:, :2] = x[:, :2] @ f.T
-        exact, regularised = (hessian(membrane, x, None, blend) for blend in (0.0, 1.0))
+        exact, regularised = (hessian(membrane, x, None, convexity) for convexity in (0.0, 1.0))
         order = membrane.stencil[0]
         green, stress = (values[0] for values in membrane.strain_and_stress(x))
         data = membrane.elements.data

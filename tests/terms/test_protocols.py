@@ -196,7 +196,7 @@ class Idle(Elastic):
     def add_gradient(self, x: Array, frozen: Any, out: Array) -> None:
         self.calls.add("add_gradient")
 
-    def hessians(self, x: Array, frozen: Any, lo: int, hi: int, blend: float, out: Array) -> None:
+    def hessians(self, x: Array, frozen: Any, lo: int, hi: int, convexity: float, out: Array) -> None:
         out[:] = 0.0
 
     def force_scale(self, size: float) -> Array:

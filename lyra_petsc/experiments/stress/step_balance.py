@@ -239,7 +239,7 @@ class BalanceRecorder:
             setattr(self, name, values)
         x0, x1 = self._x, equations.x
         dx, sheet = x1 - x0, self._frozen(self._sheet_terms)
-        frames = {term: old for term, old in self._frames.items() if sheet[term] is not old}
+        frames = {term: old for term, old in self._frames.items() if sheet[term].number != old.number}
         parts, within = self._force_terms(dt)
         size_of_g = float(np.linalg.norm(simulation.scene.gravity or 0.0))
         turned, inner, free_dx, all_dx, energy_noise, forces, powers, heights = layout.global_sum(

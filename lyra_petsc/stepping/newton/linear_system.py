@@ -280,12 +280,12 @@ class LinearSystem:
         """Prepare for a new solve, in which nothing of the last one can be kept."""
         self.kept_preconditioner = self.uses_operator = False
 
-    def assemble(self, at: Evaluation, blend: float, *, keep: bool, convex: bool) -> Array | None:
+    def assemble(self, at: Evaluation, convexity: float, *, keep: bool, convex: bool) -> Array | None:
         """Assemble the Jacobian and the preconditioning matrix at the `linearised` stage.
 
         Parameters
         ----------
-        blend : float
+        convexity : float
             Weight of the regularised Hessian.
         keep : bool
             Whether the preconditioner of the last iteration can be kept.
@@ -297,7 +297,7 @@ class LinearSystem:
         (n_owned, 3) or None
             As `StageForces.jacobian`.
         """
-        force = self.assemble_operator(at, blend)
+        force = self.assemble_operator(at, convexity)
         if self.preconditioner is not self.operator and not self.reuse.begin_solve(self._equations):
             self._set_preconditioner(at, keep=keep, convex=convex)
         self._equations.directors.forget()
@@ -319,15 +319,15 @@ class LinearSystem:
         elif not keep:
             self._set_regularised(at)
 
-    def assemble_operator(self, at: Evaluation, blend: float) -> Array | None:
+    def assemble_operator(self, at: Evaluation, convexity: float) -> Array | None:
         """Assemble the Jacobian at the `linearised` stage with this weight of the regularised Hessian."""
-        force = self._jacobian(at, blend, self.operator.rows)
+        force = self._jacobian(at, convexity, self.operator.rows)
         self.operator.set(self.operator.rows)
         return force
 
-    def _jacobian(self, at: Evaluation, blend: float, rows: Array) -> Array | None:
+    def _jacobian(self, at: Evaluation, convexity: float, rows: Array) -> Array | None:
         predicted = self._equations.predicted_stress.positions
-        return self._equations.forces.jacobian(at, blend, rows, predicted)
+        return self._equations.forces.jacobian(at, convexity, rows, predicted)
 
     def _set_regularised(self, at: Evaluation) -> None:
         self._jacobian(at, 1.0, self.preconditioner.rows)
@@ -375,9 +375,9 @@ class LinearSystem:
         self.kept_preconditioner = self.uses_operator = False
 
     @logged(JACOBIAN_AGAIN)
-    def reassemble_operator(self, at: Evaluation, blend: float) -> None:
+    def reassemble_operator(self, at: Evaluation, convexity: float) -> None:
         """As `assemble_operator`, logged as a repeated assembly."""
-        self.assemble_operator(at, blend)
+        self.assemble_operator(at, convexity)
 
     def _free(self, *, permanently: bool) -> None:
         self._equations.damping.release_values()

@@ -15,8 +15,8 @@ from lyra_petsc.linear.pivots import negative_pivots
 from lyra_petsc.phases import JACOBIAN, logged
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.directors import turn_with_triangles
-from lyra_petsc.stepping.newton.blend import HessianBlend
 from lyra_petsc.stepping.newton.convergence import Convergence
+from lyra_petsc.stepping.newton.convexity import Convexity
 from lyra_petsc.stepping.newton.globalisation import Globalisation, descends
 from lyra_petsc.stepping.newton.inexact import Forcing
 from lyra_petsc.stepping.newton.iterates import Iterates
@@ -42,7 +42,7 @@ class NewtonCallbacks:
     snes : PETSc.SNES
     equations : StageEquations
     linear : LinearSystem
-    blend : HessianBlend
+    convexity : Convexity
     convergence : Convergence
     points : Iterates
     iterates : bool
@@ -65,7 +65,7 @@ class NewtonCallbacks:
         snes: PETSc.SNES,
         equations: StageEquations,
         linear: LinearSystem,
-        blend: HessianBlend,
+        convexity: Convexity,
         convergence: Convergence,
         points: Iterates,
         *,
@@ -73,7 +73,7 @@ class NewtonCallbacks:
         follow: Callable[[], bool],
     ) -> None:
         self._snes, self._ksp, self._equations = snes, snes.getKSP(), equations
-        self._linear, self._blend, self._points, self._iterates = linear, blend, points, iterates
+        self._linear, self._convexity, self._points, self._iterates = linear, convexity, points, iterates
         self.convergence, self.globalisation = (
             convergence,
             Globalisation(snes, equations, points, convergence),
@@ -127,9 +127,9 @@ class NewtonCallbacks:
             self.forcing.before_solve(self.convergence)
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         exact = self._full_steps is not None and self.convergence.halved
-        blend = self._blend.after(self._taken(u), exact=exact)
+        convexity = self._convexity.after(self._taken(u), exact=exact)
         keep = self.convergence.fell_fast
-        by_prescribed = self._linear.assemble(at, blend, keep=keep, convex=self._convex)
+        by_prescribed = self._linear.assemble(at, convexity, keep=keep, convex=self._convex)
         if by_prescribed is not None:
             force = self._snes.getFunction()[0].getArray().reshape(self._shape)
             force += by_prescribed
@@ -188,7 +188,7 @@ class NewtonCallbacks:
             changed |= self._limit_step(x, residual, y)
         changed |= curved
         if shell is not None:
-            exact = self._linear.uses_operator and self._blend.value == 0.0
+            exact = self._linear.uses_operator and self._convexity.value == 0.0
             before = shell.iterations
             changed |= shell.correct(v, y, exact=exact)
             self.extra_iterations += shell.iterations - before
@@ -206,9 +206,9 @@ class NewtonCallbacks:
         at = self._points.at(x)
         if failed_factors.replace_failed(self._ksp) or self._linear.improve_preconditioner(at):
             return True
-        if not self._blend.increase():
+        if not self._convexity.increase():
             return False
-        self._linear.reassemble_operator(at, self._blend.value)
+        self._linear.reassemble_operator(at, self._convexity.value)
         return True
 
     def _apply_contact_model(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
@@ -221,10 +221,10 @@ class NewtonCallbacks:
 
         def renew() -> None:
             if self._follow():
-                self._linear.assemble(at(), self._blend.value, keep=False, convex=self._convex)
+                self._linear.assemble(at(), self._convexity.value, keep=False, convex=self._convex)
 
         def ease() -> bool:
-            self._linear.reassemble_operator(at(), self._blend.value)
+            self._linear.reassemble_operator(at(), self._convexity.value)
             return self._ease_linear_solve(x)
 
         solves = RepeatedSolves(self._ksp, self._linear, at, renew, ease)
@@ -315,7 +315,7 @@ class NewtonCallbacks:
             "convex": self._convex_at_start,
             **self.forcing.saved_state(),
             **self.convergence.saved_state(),
-            **self._blend.saved_state(),
+            **self._convexity.saved_state(),
             **self._linear.shift.saved_state(),
         }
 
@@ -324,7 +324,7 @@ class NewtonCallbacks:
         self._convex_at_start = bool(saved["convex"])
         self.forcing.restore(saved)
         self.convergence.restore(saved)
-        self._blend.restore(saved)
+        self._convexity.restore(saved)
         self._linear.shift.restore(saved)
 
     @property

@@ -33,8 +33,8 @@ class LoadStepProgress:
 
     def record_force(self, force: float, linear_iterations: int | None) -> None:
         """Note the out-of-balance force [N] after a solve, or before the first (no iterations)."""
-        blend = None if linear_iterations is None else 1.0
-        self.history.append(Iteration(force, linear_iterations or 0, 0, blend))
+        convexity = None if linear_iterations is None else 1.0
+        self.history.append(Iteration(force, linear_iterations or 0, 0, convexity))
 
     def record_potential(self, energy: float) -> None:
         """Note the potential energy [J] after a solve; if it is given once, then for all."""

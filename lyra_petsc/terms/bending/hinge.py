@@ -11,7 +11,6 @@ The energy of a hinge fades out if a triangle's area is below a tenth of its res
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -24,9 +23,9 @@ from lyra_petsc.terms.bending import hinge_fading, hinge_forces, hinge_shape
 from lyra_petsc.terms.bending.hinge_energy import fading_limit
 from lyra_petsc.terms.bending.hinge_rows import add_across, add_within
 from lyra_petsc.terms.bending.hinge_triangles import triangles_of
-from lyra_petsc.terms.remembered import Remembered
+from lyra_petsc.terms.position_cache import PositionCache
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Couplings, Elastic, OffDiagonal, Offsets
+from lyra_petsc.terms.term import Assembly, Couplings, Elastic, OffDiagonal
 
 Stencil = NDArray[np.int32] | NDArray[np.int64]
 
@@ -84,7 +83,7 @@ class Bending(Elastic):
         self._limit = np.empty(len(self._triangles.corners))
         self._limit[self._triangles.sides[:-1] >> 2] = data["limit"]
         # energy, gradient and Hessian are usually computed at the same positions
-        self._geometry = Remembered(self._compute_geometry)
+        self._geometry = PositionCache(self._compute_geometry)
 
     def _compute_geometry(self, x: Array) -> HingeGeometry:
         corners, sides, _ = self._triangles
@@ -139,25 +138,18 @@ class Bending(Elastic):
     def couplings(self) -> Couplings:
         return {self.name: self._triangles.corners, f"{self.name} across": OffDiagonal(self.stencil[:, 2:])}
 
-    def add_hessian(
-        self,
-        x: Array,
-        frozen: None,
-        blend: float,
-        weight: Array,
-        offsets: Mapping[str, Offsets],
-        values: Array,
-        predicted: tuple[Array, Array] | None = None,
-    ) -> None:
+    def add_hessian(self, x: Array, frozen: None, into: Assembly) -> None:
         corners, sides, hinges = self._triangles
-        within, across, geometry = offsets[self.name], offsets[f"{self.name} across"], self._geometry(x)
+        within, across = into.offsets[self.name], into.offsets[f"{self.name} across"]
+        geometry, convexity = self._geometry(x), into.convexity
         triangles, angles, lengths, fading = geometry
         factors = np.empty((self.n_elements + 1, 2))
-        law = self._k, self._rest, weight
-        add_across(sides, triangles, angles, lengths, blend, *law, across, values, factors)
+        law, values = (convexity, self._k, self._rest, into.weight), into.values
+        add_across(sides, triangles, angles, lengths, *law, across, values, factors)
         add_within(x, corners, hinges, sides, triangles, factors, within, values)
         if len(fading):
-            hinge_fading.add_hessian(x, *self._fading(geometry), blend, weight, within, across, values)
+            to = into.weight, within, across, values
+            hinge_fading.add_hessian(x, *self._fading(geometry), convexity, *to)
         self._geometry.forget()  # frees memory for the linear solve that follows
 
     def force_scale(self, size: float) -> Array:

@@ -32,17 +32,14 @@ from lyra_petsc.terms.protocols import MovingTargets
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import UpcomingStep
 
-NO_LIMIT = 0.0
-"""Limit of |n|² [m⁴] for the mirror image, which is rigid and never fades."""
-
 
 @kernel()
 def energies(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
-    """Write the energy [J] of the first len(out) edges."""
+    """Write the energy [J] of the first len(out) edges; the mirror image is rigid and never fades."""
     for e in range(out.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
         theta, square1, square2 = angle(x0, x1, x2, x3)
-        out[e] = hinge_energy(theta, square1, square2, k[e], rest[e], (limit[e], NO_LIMIT))
+        out[e] = hinge_energy(theta, square1, square2, k[e], rest[e], (limit[e], 0.0))
 
 
 @kernel()
@@ -52,7 +49,7 @@ def _gradient(x, s, mirror, k, rest, limit, e, g):  # type: ignore[no-untyped-de
     """
     x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
     theta = angle(x0, x1, x2, x3)[0]
-    return hinge_gradient(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], NO_LIMIT), g)
+    return hinge_gradient(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], 0.0), g)
 
 
 @kernel()
@@ -67,13 +64,13 @@ def add_gradient(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-
 
 
 @kernel()
-def hessians(x, s, lo, hi, blend, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
+def hessians(x, s, lo, hi, convexity, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Write the Hessian blocks [N/m] of edges lo..hi into out (hi − lo, 3, 3, 3, 3)."""
     g, o = np.empty((4, 3)), np.empty((4, 4, 3, 3))
     for e in range(lo, hi):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
         theta = angle(x0, x1, x2, x3)[0]
-        hinge_hessian(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], NO_LIMIT), blend, g, o)
+        hinge_hessian(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], 0.0), convexity, g, o)
         out[e - lo] = o[:3, :3]
 
 
@@ -154,8 +151,8 @@ class Clamp(MovingTargets):
         constants = frozen.mirror[held], frozen.k[held], self._rest[held], self._limit[held]
         add_gradient(x, self.stencil[held], *constants, out)
 
-    def hessians(self, x: Array, frozen: Mirrors, lo: int, hi: int, blend: float, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, blend, frozen.mirror, frozen.k, self._rest, self._limit, out)
+    def hessians(self, x: Array, frozen: Mirrors, lo: int, hi: int, convexity: float, out: Array) -> None:
+        hessians(x, self.stencil, lo, hi, convexity, frozen.mirror, frozen.k, self._rest, self._limit, out)
         out[frozen.k[lo:hi] == 0.0] = 0.0
 
     def targets(self, x: Array, frozen: Mirrors) -> tuple[Array, Array]:

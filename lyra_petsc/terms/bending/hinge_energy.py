@@ -82,10 +82,10 @@ def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[n
 
 
 @kernel()
-def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, blend, g, out):  # type: ignore[no-untyped-def]
+def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, convexity, g, out):  # type: ignore[no-untyped-def]
     """Write the Hessian blocks [N/m] into out (4, 4, 3, 3); g (4, 3) is work space.
 
-    ``blend`` 0 is exact, 1 the positive-semidefinite 2 k ∇θ ∇θᵀ w(a1) w(a2).
+    ``convexity`` 0 is exact, 1 the positive-semidefinite 2 k ∇θ ∇θᵀ w(a1) w(a2).
     """
     square1, square2 = _write_angle_gradient(x0, x1, x2, x3, g)
     change = theta - rest
@@ -95,10 +95,10 @@ def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, blend, g, out):  # typ
             for i in range(3):
                 for j in range(3):
                     out[a, b, i, j] = stiffness * g[a, i] * g[b, j]
-    if blend < 1.0:
-        add_angle_hessian(x0, x1, x2, x3, (1.0 - blend) * stiffness * change, out)
+    if convexity < 1.0:
+        add_angle_hessian(x0, x1, x2, x3, (1.0 - convexity) * stiffness * change, out)
     if not (square1 > limits[0] and square2 > limits[1]):
-        _fade_hessian(x0, x1, x2, x3, square1, square2, limits[0], limits[1], k, change, blend, g, out)
+        _fade_hessian(x0, x1, x2, x3, square1, square2, limits[0], limits[1], k, change, convexity, g, out)
 
 
 @kernel()
@@ -169,7 +169,7 @@ def add_square_hessian(y, n, at, scale, out):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _fade_hessian(  # type: ignore[no-untyped-def]
-    x0, x1, x2, x3, square1, square2, limit1, limit2, k, change, blend, g, out
+    x0, x1, x2, x3, square1, square2, limit1, limit2, k, change, convexity, g, out
 ):
     """Replace the Hessian of f = k (θ − θ̄)² in out (4, 4, 3, 3) by that of f W, W = w(a1) w(a2)."""
     w1, d1, dd1 = fade(square1, limit1)
@@ -179,7 +179,7 @@ def _fade_hessian(  # type: ignore[no-untyped-def]
         return
     out *= w1 * w2
     # the regularised Hessian consists of the term above only
-    force, value = (1.0 - blend) * 2.0 * k * change, (1.0 - blend) * k * change * change
+    force, value = (1.0 - convexity) * 2.0 * k * change, (1.0 - convexity) * k * change * change
     n1, n2 = _normals(x0, x1, x2, x3)
     slopes, bent = np.empty((2, 4, 3)), np.zeros((4, 4, 3, 3))
     _square_gradients(x0, x1, x2, x3, slopes)

@@ -87,14 +87,14 @@ def hinge_offsets(h, s, sides, within, across, out):  # type: ignore[no-untyped-
 
 @kernel()
 def add_hessian(  # type: ignore[no-untyped-def]
-    x, s, sides, fading, limit, theta, k, rest, blend, weight, within, across, values
+    x, s, sides, fading, limit, theta, k, rest, convexity, weight, within, across, values
 ):
-    """Add weight (E,) times all blocks of hinges that fade; ``blend`` 0 is exact."""
+    """Add weight (E,) times all blocks of hinges that fade; ``convexity`` 0 is exact."""
     offsets = np.empty(10, dtype=within.dtype)
     gradient, blocks = np.empty((4, 3)), np.empty((4, 4, 3, 3))
     for h in fading:
         x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
         limits = limits_of(limit, sides, h)
-        hinge_hessian(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, blend, gradient, blocks)
+        hinge_hessian(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, convexity, gradient, blocks)
         hinge_offsets(h, s, sides, within, across, offsets)
         add_element(weight[h], blocks, offsets, values)

@@ -28,8 +28,8 @@ def ends(corner):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def add_across(sides, shape, theta, length, blend, k, rest, weight, across, values, factors):  # type: ignore[no-untyped-def]
-    """Add weight (E,) times the blocks across the hinges' edges; ``blend`` 0 is exact.
+def add_across(sides, shape, theta, length, convexity, k, rest, weight, across, values, factors):  # type: ignore[no-untyped-def]
+    """Add weight (E,) times the blocks across the hinges' edges; ``convexity`` 0 is exact.
 
     Writes ``factors`` (E + 1, 2), k'/s and z/√s times the weight, for ``add_within``; 0 for hinges that fade,
     which are left out.
@@ -44,7 +44,8 @@ def add_across(sides, shape, theta, length, blend, k, rest, weight, across, valu
         one, two = triangles_at(sides, h)
         square = length[h] * length[h]
         stiffness = 2.0 * k[h] * weight[h] / square
-        factors[h, 0], factors[h, 1] = stiffness, (1.0 - blend) * stiffness * (theta[h] - rest[h]) * length[h]
+        turned = (1.0 - convexity) * stiffness * (theta[h] - rest[h]) * length[h]
+        factors[h, 0], factors[h, 1] = stiffness, turned
         areas = shape[one, 6] * shape[two, 6]
         left = scaled(stiffness * square * square / areas, (shape[one, 0], shape[one, 1], shape[one, 2]))
         right = shape[two, 0], shape[two, 1], shape[two, 2]

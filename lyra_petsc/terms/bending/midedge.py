@@ -51,10 +51,10 @@ from lyra_petsc.terms.bending.midedge_shape import (
     unit,
 )
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.position_cache import PositionCache, unwritable
 from lyra_petsc.terms.protocols import LARGEST_ROTATION, HasDirectors, Place, TermState
-from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Offsets, Term, UpcomingStep
+from lyra_petsc.terms.term import Assembly, Term, UpcomingStep
 
 AnyInts = NDArray[np.int32] | NDArray[np.int64]
 
@@ -131,9 +131,8 @@ class MidEdge(HasDirectors):
         rest = data["rest"] if data["rest"].any() else NO_REST_TANGENTS
         self._rest_rotation = rest_rotation_of(data)
         self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
-        self._cached_tangents: Remembered[Array] | None = None
-        self._cached_frames: Frames | None = None
-        self._at_end: Frames | None = None  # those that ``frames_at_end`` returned
+        self._tangents = PositionCache(self._compute_tangents)
+        self._end_frames = -1  # the number of those that `frames_at_end` returned
         self._membrane: Membrane | None = None  # if it has the same triangles
 
     def connect(self, terms: Iterable[Term]) -> None:
@@ -175,14 +174,15 @@ class MidEdge(HasDirectors):
         return self.frames
 
     def accept(self, x: Array, frozen: Frames) -> None:
-        if frozen is not self._at_end:
+        if frozen.number != self._end_frames:
             self.clear_cache()  # the cached tangents are those of the old frames
             frozen = self._transported(frozen, x)
         self.frames = frozen
 
     def frames_at_end(self, x: Array, frozen: Frames) -> Frames:
-        self._at_end = self._transported(frozen, x)
-        return self._at_end
+        frames = self._transported(frozen, x)
+        self._end_frames = frames.number
+        return frames
 
     def edge_stiffness(self, weight: Array | None = None) -> Array:
         diagonal = self.elements.data["stiffness"][:, [0, 3, 5]]
@@ -264,7 +264,7 @@ class MidEdge(HasDirectors):
         # in one allocation: once it is freed, an array larger than either fits into its memory
         direction, reference = np.empty((2, len(self.of_edges.ends), 3))
         directions(x, self.of_edges.ends, direction)
-        transport(*frames, direction, reference)
+        transport(*frames.vectors, direction, reference)
         return Frames(direction, reference)
 
     def _edge_directions(self, x: Array) -> Array:
@@ -273,7 +273,7 @@ class MidEdge(HasDirectors):
         return direction
 
     def state(self) -> dict[str, TermState]:
-        direction, reference = self.frames
+        direction, reference = self.frames.vectors
         base = some_perpendicular(direction)
         side = np.sum(np.cross(direction, base) * reference, axis=1)
         return {"frame": TermState(Place.EDGE, np.arctan2(side, np.sum(base * reference, axis=1)))}
@@ -306,13 +306,10 @@ class MidEdge(HasDirectors):
 
     def angle_tangents(self, x: Array, frames: Frames) -> Array:
         """Tangents T of directors' angles and |N|² of triangles, (E, 4), by `midedge_shape.tangents`."""
-        if self._cached_tangents is None or self._cached_frames is not frames:
-            self._cached_frames = frames
-            self._cached_tangents = Remembered(lambda at: self._compute_tangents(at, frames))
-        return self._cached_tangents(x)
+        return self._tangents(x, frames)
 
     def clear_cache(self) -> None:
-        self._cached_tangents = self._cached_frames = None
+        self._tangents.forget()
 
     def _compute_tangents(self, x: Array, frames: Frames) -> Array:
         tangent = np.empty((self.n_elements, 4))
@@ -326,7 +323,7 @@ class MidEdge(HasDirectors):
         # NumPy's functions of whole arrays use SIMD instructions
         cosine, sine = np.cos(angle), np.sin(angle, out=angle)
         out = np.empty((len(angle), 3))
-        directors(x, self.of_edges.ends, *frames, cosine, sine, out)
+        directors(x, self.of_edges.ends, *frames.vectors, cosine, sine, out)
         return out
 
     def energies(self, x: Array, frozen: Frames) -> Array:
@@ -343,20 +340,11 @@ class MidEdge(HasDirectors):
         bent = frozen.direction, self.angle_tangents(x, frozen), *self._constants
         midedge_energy.add_gradient(x, *numbers, *bent, self.of_edges.length, out)
 
-    def add_hessian(
-        self,
-        x: Array,
-        frozen: Frames,
-        blend: float,
-        weight: Array,
-        offsets: Mapping[str, Offsets],
-        values: Array,
-        predicted: tuple[Array, Array] | None = None,
-    ) -> None:
+    def add_hessian(self, x: Array, frozen: Frames, into: Assembly) -> None:
         numbers = self.of_edges.of_triangles, self.elements.data["sign"]
         bent = frozen.direction, self.angle_tangents(x, frozen), *self._constants, self.of_edges.length
-        at = offsets[f"{self.name} vertices"], offsets[self.name]
-        midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *bent, weight, *at, values)
+        at = into.offsets[f"{self.name} vertices"], into.offsets[self.name], into.values
+        midedge_energy.add_hessian(x, self.stencil, into.convexity, *numbers, *bent, into.weight, *at)
 
     def largest_rotation(self, increment: Array) -> float:
         return float(largest_angle(increment.ravel(), self.of_edges.indices, self.of_edges.length))
@@ -534,10 +522,10 @@ def _align_with_symmetry(director: Array, rest: RestShape, triangles: Ints, numb
     the same orientation relative to each triangle.
     """
     mesh = rest.mesh
-    for handle, each in enumerate(rest.scene.handles):
-        if each.symmetry is None:
+    for index, handle in enumerate(rest.scene.handles):
+        if handle.symmetry is None:
             continue
-        held = select_vertices(mesh, each, key=f"handles[{handle}]", file=rest.scene.source)
+        held = select_vertices(mesh, handle, key=f"handles[{index}]", file=rest.scene.source)
         ends = triangles[:, [[1, 2], [2, 0], [0, 1]]]
         face, side = np.nonzero(np.isin(ends, held).all(axis=2))
         edges, corners = number[face, side], ends[face, side]
@@ -548,7 +536,7 @@ def _align_with_symmetry(director: Array, rest: RestShape, triangles: Ints, numb
             return np.stack([along, np.cross(normal, along), normal], axis=1)
 
         start, here = axes(mesh.positions), axes(x)
-        plane = np.einsum("eik,ei->ek", here, start[:, :, AXES.index(each.symmetry)])
+        plane = np.einsum("eik,ei->ek", here, start[:, :, AXES.index(handle.symmetry)])
         inside = unit(np.cross(plane, here[:, 0]))
         towards = np.sum(inside * director[edges], axis=1, keepdims=True)
         director[edges] = np.where(towards < 0.0, -inside, inside)

@@ -86,78 +86,78 @@ class ClampedEdges:
     ) -> None:
         self.term = term
         self._handles: dict[int, _Handle] = {}
-        for number, each in elements.items():
-            assert each.edges is not None
-            mine = np.isin(each.edges[:, 0], owned)
-            indices = np.asarray(each.edges[mine, 0], dtype=np.int64)
+        for number, clamped in elements.items():
+            assert clamped.edges is not None
+            mine = np.isin(clamped.edges[:, 0], owned)
+            indices = np.asarray(clamped.edges[mine, 0], dtype=np.int64)
             edges = np.searchsorted(term.of_edges.indices, indices)
-            stencil = each.stencil[mine].astype(np.int64)
+            stencil = clamped.stencil[mine].astype(np.int64)
             self._handles[number] = _Handle(indices, edges, stencil, *handles[number])
 
     @property
     def windows(self) -> dict[int, Window]:
         """The time window in which each handle clamps, by its number."""
-        return {number: each.window for number, each in self._handles.items()}
+        return {number: clamped.window for number, clamped in self._handles.items()}
 
     @property
     def reference_rows(self) -> Ints:
         """Local rows (n,) whose reference positions at the start of handles are needed."""
         none = np.empty(0, dtype=np.int64)
-        return np.concatenate([none, *(each.stencil.ravel() for each in self._handles.values())])
+        return np.concatenate([none, *(clamped.stencil.ravel() for clamped in self._handles.values())])
 
     def indices(self, number: int) -> Ints:
         """Indices (n,) of the edge unknowns that a handle prescribes, in flattened arrays over owned rows."""
-        each = self._handles.get(number)
-        return np.empty(0, dtype=np.int64) if each is None else each.indices
+        handle = self._handles.get(number)
+        return np.empty(0, dtype=np.int64) if handle is None else handle.indices
 
     def targets(self, number: int, at: float, reference: Callable[[float, Ints], Array], out: Array) -> None:
         """Write the unknowns that a handle prescribes at time ``at`` [s] into ``out`` (n,).
 
         Of the angles that differ by full turns the one nearest to the present unknown in ``out`` is taken.
         """
-        each = self._handles.get(number)
-        if each is None or each.symmetric:
+        handle = self._handles.get(number)
+        if handle is None or handle.symmetric:
             return
-        plane = self._plane(each, at, reference)
-        edges, (t0, a0) = self.term.of_edges, self.term.frames
+        plane = self._plane(handle, at, reference)
+        edges, (t0, a0) = self.term.of_edges, self.term.frames.vectors
         tangent = unit(plane.edge)
         director = unit(np.cross(plane.edge, plane.inward))
-        base = transported(Frames(t0[each.edges], a0[each.edges]), tangent)
+        base = transported(Frames(t0[handle.edges], a0[handle.edges]), tangent)
         sine = np.sum(np.cross(tangent, base) * director, axis=1)
         angle = np.arctan2(sine, np.sum(base * director, axis=1))
-        length = edges.length[each.edges]
-        now = out[each.indices] / length
-        out[each.indices] = length * (angle + 2.0 * np.pi * np.round((now - angle) / (2.0 * np.pi)))
+        length = edges.length[handle.edges]
+        now = out[handle.indices] / length
+        out[handle.indices] = length * (angle + 2.0 * np.pi * np.round((now - angle) / (2.0 * np.pi)))
 
     def rates(self, number: int, at: float, reference: Callable[[float, Ints], Array], out: Array) -> None:
         """Write the rates of a handle's unknowns at time ``at`` [s] into ``out`` (n,)."""
-        each = self._handles.get(number)
-        if each is None or each.symmetric:
+        handle = self._handles.get(number)
+        if handle is None or handle.symmetric:
             return
-        e, w, de, dw = self._plane(each, at, reference)
+        e, w, de, dw = self._plane(handle, at, reference)
         size = np.linalg.norm(e, axis=1)
         tangent, normal = unit(e), np.cross(e, w)
         height = np.linalg.norm(normal, axis=1)
         director = normal / height[:, None]
         normal_rate = np.cross(de, w) + np.cross(e, dw)
         spin = np.sum(normal_rate * np.cross(tangent, director), axis=1) / height
-        t0 = self.term.frames.direction[each.edges]
+        t0 = self.term.frames.direction[handle.edges]
         cosine = 1.0 + np.sum(t0 * tangent, axis=1)
         frame_spin = -np.sum(np.cross(t0, tangent) * de, axis=1) / (cosine * size)
-        out[each.indices] = self.term.of_edges.length[each.edges] * (spin - frame_spin)
+        out[handle.indices] = self.term.of_edges.length[handle.edges] * (spin - frame_spin)
 
     def moment(self, number: int, reaction: Array, x: Array, frames: Frames) -> Array:
         """Moment (3,) [N·m] of a handle on this rank's edges, without that of the forces at their ends.
 
         ``reaction`` (n,) [N] is the force on their unknowns at positions x (n_local, 3) [m].
         """
-        each = self._handles.get(number)
-        if each is None:
+        handle = self._handles.get(number)
+        if handle is None:
             return np.zeros(3)
-        return self.term.moment(reaction, each.edges, x, frames)
+        return self.term.moment(reaction, handle.edges, x, frames)
 
-    def _plane(self, each: _Handle, at: float, reference: Callable[[float, Ints], Array]) -> _Plane:
-        rows, start = each.stencil, each.window.start
+    def _plane(self, handle: _Handle, at: float, reference: Callable[[float, Ints], Array]) -> _Plane:
+        rows, start = handle.stencil, handle.window.start
         points = reference(start, rows.ravel()).reshape(*rows.shape, 3)
         local = np.arange(8 * len(points)).reshape(-1, 8)
         flat = points.reshape(-1, 3)
@@ -165,8 +165,8 @@ class ClampedEdges:
         tail, head = points[:, 0], points[:, 1]
         inward = tail + np.cross(normal, head - tail)  # edge × inward has the direction of the normal
         moving = np.concatenate([tail, head, inward])
-        a, b, c = np.split(each.motion.moved(moving, start, at), 3)
-        da, db, dc = np.split(each.motion.velocity(moving, start, at), 3)
+        a, b, c = np.split(handle.motion.moved(moving, start, at), 3)
+        da, db, dc = np.split(handle.motion.velocity(moving, start, at), 3)
         return _Plane(b - a, c - a, db - da, dc - da)
 
 
@@ -180,11 +180,11 @@ def elements(rest: RestShape) -> dict[int, Elements]:
     edges, first, count = np.unique(sides[by_edge], return_index=True, return_counts=True)
     one, two = (triangles[by_edge[first + k * (count - 1)] // 3] for k in (0, 1))
     ends, by_handle = rest.edges[edges], {}
-    for handle, each in enumerate(rest.scene.handles):
-        if each.holds_slope:
-            held = select_vertices(rest.mesh, each, key=f"handles[{handle}]", file=rest.scene.source)
+    for index, handle in enumerate(rest.scene.handles):
+        if handle.holds_slope:
+            held = select_vertices(rest.mesh, handle, key=f"handles[{index}]", file=rest.scene.source)
             row = np.flatnonzero(np.isin(ends, held).all(axis=1))
-            by_handle[handle] = Elements(
+            by_handle[index] = Elements(
                 np.concatenate([ends[row], one[row], two[row]], axis=1), edges=edges[row][:, None]
             )
     return by_handle

@@ -17,8 +17,8 @@ with γ_i at the two ends of the edge only, + at its head, and s_i = 1 where the
 
     −ω_d n ∇b_cᵀ − ω_c ∇b_d nᵀ + σ_c σ_d (n τᵀ + τ nᵀ) − ½ σ_c σ_d s_i (γ ρᵀ + ρ γᵀ),   τ = −m_i / (2 |e_i|²)
 
-with σ = 1 and −1 at the ends of the edge and 0 opposite it. ``blend`` 0 is exact, 1 the positive-semidefinite
-∇f K ∇fᵀ.
+with σ = 1 and −1 at the ends of the edge and 0 opposite it. ``convexity`` 0 is exact, 1 the
+positive-semidefinite ∇f K ∇fᵀ.
 
 Arrays: ``tangent`` (E, 4) is the output of ``midedge_shape.tangents``; ``frame`` (n_edges, 3) are the
 directions t₀ of the edges' frames, from which γ is computed; ``rest`` (E, 3) is T̄, empty if all are 0.
@@ -512,7 +512,7 @@ def _compute_hessians(exact, batch):  # type: ignore[no-untyped-def]
 def add_hessian(  # type: ignore[no-untyped-def]
     x,
     stencil,
-    blend,
+    convexity,
     edges,
     sign,
     frame,
@@ -532,7 +532,7 @@ def add_hessian(  # type: ignore[no-untyped-def]
 
     Only corners 1 and 2 are computed: corner 0 follows from invariance under translation.
     """
-    flat, exact, batch = values.reshape(-1), 1.0 - blend, np.zeros(88 * BATCH)
+    flat, exact, batch = values.reshape(-1), 1.0 - convexity, np.zeros(88 * BATCH)
     for e in range(stencil.shape[0]):
         _fetch_ahead(e, corners, offsets, values)
         i = Index(e % BATCH)

@@ -26,10 +26,10 @@ from lyra_petsc.terms.bending import hinge, midedge, midedge_energy
 from lyra_petsc.terms.bending.hinge import edge_in_material
 from lyra_petsc.terms.bending.midedge import NO_FRICTION, MidEdge
 from lyra_petsc.terms.bending.midedge_shape import Frames
+from lyra_petsc.terms.position_cache import PositionCache
 from lyra_petsc.terms.protocols import Dissipates, Place, SharesFrozen, TermState
-from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Offsets, Term, UpcomingStep
+from lyra_petsc.terms.term import Assembly, Term, UpcomingStep
 
 YIELD_CURVATURE = 2.0
 """κ_y [1/m]: change of curvature at which friction reaches its limit."""
@@ -71,8 +71,7 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         super().__init__(elements)
         data = elements.data
         self.bent: Array = data["rest"].copy()
-        self._slides: Remembered[tuple[Array, ...]] | None = None
-        self._frames: Frames | None = None
+        self._sliding = PositionCache(self._compute_sliding)
 
     def connect(self, terms: Iterable[Term]) -> None:
         self.partner = sheet = next(term for term in terms if isinstance(term, MidEdge))
@@ -92,13 +91,7 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
 
     # -- energy ------------------------------------------------------------------------------------
 
-    def _sliding(self, x: Array, frames: Frames) -> Sliding:
-        if self._slides is None or self._frames is not frames:
-            self._frames = frames
-            self._slides = Remembered(lambda at: self._computed(at, frames))
-        return Sliding(*self._slides(x))
-
-    def _computed(self, x: Array, frames: Frames) -> Sliding:
+    def _compute_sliding(self, x: Array, frames: Frames) -> Sliding:
         half, data = np.empty(self.n_elements), self.elements.data
         tangent = self._sheet.angle_tangents(x, frames)[self._rows]
         constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
@@ -125,20 +118,12 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
         midedge_energy.add_gradient(x, *numbers, frozen.direction, *constants, out)
 
-    def add_hessian(
-        self,
-        x: Array,
-        frozen: Frames,
-        blend: float,
-        weight: Array,
-        offsets: Mapping[str, Offsets],
-        values: Array,
-        predicted: tuple[Array, Array] | None = None,
-    ) -> None:
+    def add_hessian(self, x: Array, frozen: Frames, into: Assembly) -> None:
         constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
         numbers = self._edges, self.elements.data["sign"], frozen.direction
-        at = offsets[f"{self.name} vertices"], offsets[self.name]
-        midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
+        at = into.offsets[f"{self.name} vertices"], into.offsets[self.name], into.values
+        law = into.convexity, *numbers, *constants
+        midedge_energy.add_hessian(x, self.stencil, *law, into.weight, *at)
 
     def force_scale(self, size: float) -> Array:
         data = self.elements.data
@@ -157,7 +142,8 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         return np.where((part < 1.0) & np.isfinite(tangent), slid, self.bent)
 
     def _become(self, bent: Array) -> None:
-        self.bent, self._slides = bent, None
+        self.bent = bent
+        self._sliding.forget()
 
     def accept(self, x: Array, frozen: Frames) -> None:
         self._become(self._bent_at(x, frozen))

@@ -25,8 +25,9 @@ directors.
 
 from __future__ import annotations
 
+import itertools
 import math
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -50,17 +51,29 @@ SMALLEST_COSINE = -0.8
 """Smallest cosine of the angle between an edge and its frame: at −1 parallel transport is undefined."""
 
 
-class Frames(NamedTuple):
+_numbers = itertools.count()
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
     """Frames of n edges, in which the angles of their directors are measured.
 
     Attributes
     ----------
     direction, reference : (n, 3)
         Unit vectors t₀ along the edges, and reference directors a₀.
+    number : int
+        Another one for each set of frames.
     """
 
     direction: Array
     reference: Array
+    number: int = field(default_factory=lambda: next(_numbers), init=False)
+
+    @property
+    def vectors(self) -> tuple[Array, Array]:
+        """Direction and reference."""
+        return self.direction, self.reference
 
 
 def unit(vectors: Array) -> Array:
@@ -87,12 +100,12 @@ def directions(x, ends, out):  # type: ignore[no-untyped-def]
 @kernel()
 def mark_turned_edges(x, ends, direction, out):  # type: ignore[no-untyped-def]
     """Mark in out (n,) the edges (n, 2) at more than 90° to ``direction`` (n, 3); return whether any is."""
-    found = False
+    any_turned = False
     for k in range(ends.shape[0]):
         e = minus(point(x, ends[k, 1]), point(x, ends[k, 0]))
         out[k] = dot(e, (direction[k, 0], direction[k, 1], direction[k, 2])) < 0.0
-        found |= out[k]
-    return found
+        any_turned |= out[k]
+    return any_turned
 
 
 @kernel()
@@ -123,7 +136,7 @@ def transport(start, reference, end, out):  # type: ignore[no-untyped-def]
 def transported(frames: Frames, direction: Array) -> Array:
     """Reference directors a (n, 3), parallel transported to edges of ``direction`` (n, 3)."""
     out = np.empty_like(direction)
-    transport(*frames, direction, out)
+    transport(*frames.vectors, direction, out)
     return out
 
 

@@ -90,7 +90,9 @@ class Spring(PullsHandles):
     def add_gradient(self, x: Array, frozen: HandleSprings, out: Array) -> None:
         np.add.at(out, self.stencil[:, 0], frozen.stiffness * self._elongation(x, frozen))
 
-    def hessians(self, x: Array, frozen: HandleSprings, lo: int, hi: int, blend: float, out: Array) -> None:
+    def hessians(
+        self, x: Array, frozen: HandleSprings, lo: int, hi: int, convexity: float, out: Array
+    ) -> None:
         out[:] = 0.0
         for axis in range(3):
             out[:, 0, 0, axis, axis] = frozen.stiffness[lo:hi, axis]

@@ -27,7 +27,7 @@ SHORTENED = 0.5
 """A step of which the line search takes less than this fraction increases the weight."""
 
 
-class HessianBlend:
+class Convexity:
     """The weight of the regularised Hessian: 0 is exact, 1 regularised.
 
     Parameters
@@ -79,13 +79,13 @@ class HessianBlend:
 
     def saved_state(self) -> dict[str, float]:
         """Entries of a checkpoint, for `restore`."""
-        return {"blend": self.value, "too_little": self._too_little, "enough": self._enough}
+        return {"convexity": self.value, "too_little": self._too_little, "enough": self._enough}
 
     def restore(self, saved: Mapping[str, float]) -> None:
         """Restore a `saved_state`."""
         if self._adaptive:
             self.value, self._too_little, self._enough = (
-                saved[name] for name in ("blend", "too_little", "enough")
+                saved[name] for name in ("convexity", "too_little", "enough")
             )
 
     @staticmethod
