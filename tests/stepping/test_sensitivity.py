@@ -14,7 +14,8 @@ import lyra_petsc
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.sensitivity import Number, Sensitivities
+from lyra_petsc.stepping.perturbed_scenes import SceneParameter
+from lyra_petsc.stepping.sensitivity import Sensitivities
 from lyra_petsc.stepping.simulation import SteppedScene
 
 STEP = 2e-4
@@ -162,7 +163,7 @@ def end(scene: Scene) -> Array:
 def tangents(scene: Scene, numbers: Mapping[str, float]) -> dict[str, Array]:
     """Derivatives of `end` with respect to each parameter, times the parameter."""
     simulation = SteppedScene(MPI.COMM_WORLD, scene)
-    chosen = [Number(key, value, abs(value)) for key, value in numbers.items()]
+    chosen = [SceneParameter(key, value, abs(value)) for key, value in numbers.items()]
     beside = Sensitivities(simulation, chosen, tolerance=1e-11)
     while not simulation.finished:
         beside.step()
@@ -259,7 +260,8 @@ def test_any_number_of_ranks() -> None:
     pulled = scene("bdf2")
     numbers = {key: NUMBERS[key] for key in ("material.bending", "material.density", "wind.density")}
     simulation = SteppedScene(MPI.COMM_WORLD, pulled)
-    beside = Sensitivities(simulation, [Number(k, v, abs(v)) for k, v in numbers.items()], tolerance=1e-11)
+    parameters = [SceneParameter(key, value, abs(value)) for key, value in numbers.items()]
+    beside = Sensitivities(simulation, parameters, tolerance=1e-11)
     while not simulation.finished:
         beside.step()
     points = simulation.problem.points
@@ -278,7 +280,7 @@ def test_a_parameter_at_its_lower_bound() -> None:
     assert np.isfinite(found["material.bending"]).all()
     pulled = scene("beuler", material)
     simulation = SteppedScene(MPI.COMM_WORLD, pulled)
-    beside = Sensitivities(simulation, [Number("material.damping", 0.0, 0.01)], tolerance=1e-11)
+    beside = Sensitivities(simulation, [SceneParameter("material.damping", 0.0, 0.01)], tolerance=1e-11)
     while not simulation.finished:
         beside.step()
     points = simulation.problem.points
@@ -297,5 +299,5 @@ def test_a_parameter_at_its_lower_bound() -> None:
 def test_a_misspelt_parameter_is_refused() -> None:
     simulation = SteppedScene(MPI.COMM_WORLD, scene("beuler"))
     with pytest.raises(InputError, match="bendig"):
-        Sensitivities(simulation, [Number("material.bendig", 1.0, 1.0)])
+        Sensitivities(simulation, [SceneParameter("material.bendig", 1.0, 1.0)])
     simulation.destroy()

@@ -22,7 +22,8 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.sensitivity import Number, Sensitivities
+from lyra_petsc.stepping.perturbed_scenes import SceneParameter
+from lyra_petsc.stepping.sensitivity import Sensitivities
 from lyra_petsc.terms.protocols import Dissipates, LimitsStep
 from lyra_petsc.terms.registry import needed_terms
 
@@ -157,7 +158,7 @@ class Model:
             sensitivities: Sensitivities | None = None
             if derivatives:
                 chosen = [
-                    Number(key, float(value), size)
+                    SceneParameter(key, float(value), size)
                     for key, value, size in zip(self.keys, numbers, self._sizes, strict=True)
                 ]
                 tolerance = min(1e-6, 0.01 * scene.solver.force_tolerance)
