@@ -198,7 +198,8 @@ class StageEquations:
         frozen = self.active.freeze(self.targets_at(at, x))
         self.directors.begin_step()
         known = self.state.evaluation
-        if known and any(frozen[term] is not known.step.frozen[term] for term in self.active.with_edges):
+        terms = self.active.with_edges
+        if known and any(frozen[term].number != known.step.frozen[term].number for term in terms):
             self.state.evaluation = None  # its forces are those with other frames
         viscous = self.active.viscous if lagged else []
         wind = self.forces.sum(viscous, self.v, frozen) if viscous else None

@@ -184,7 +184,7 @@ def test_a_free_strip_is_counted_for_what_it_is(
     pull: float, negative: int, rigid: int, comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pulled at its ends it resists two rotations; pressed it gives way in them before it buckles."""
-    monkeypatch.setattr("lyra_petsc.stepping.statics.equilibrium.MAX_DESCENTS", 0)
+    monkeypatch.setattr("lyra_petsc.stepping.statics.descent.MAX_DESCENTS", 0)
     loads = [{"group": side, "force": [sign * pull, 0, 0]} for side, sign in (("right", 1), ("left", -1))]
     scene = {
         "mesh": grid(1.0, 0.2, 16, 2, "alternating"),
@@ -203,7 +203,7 @@ def test_a_hinged_sheet_hangs_and_does_not_stand(
     up: bool, comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its rotation about the hinge is a rigid motion with the stiffness of its weight."""
-    monkeypatch.setattr("lyra_petsc.stepping.statics.equilibrium.MAX_DESCENTS", 0)
+    monkeypatch.setattr("lyra_petsc.stepping.statics.descent.MAX_DESCENTS", 0)
     scene = {
         "mesh": grid(1.0, 0.3, 8, 3, "alternating"),
         "material": sheet(1e-2) | {"density": 1e-3},

@@ -11,7 +11,7 @@ from physics import CLOTH, finished, grid, scene_of, shape
 
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.stepping.statics import equilibrium
+from lyra_petsc.stepping.statics import descent
 from lyra_petsc.stepping.statics.stability import Examination, add_exact_hessian
 
 pytestmark = pytest.mark.parallel(2)
@@ -67,7 +67,7 @@ def test_a_strip_above_its_critical_weight_falls_over(weight: float, comm: MPI.C
 def test_an_equilibrium_that_remains_unstable_is_noted(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(equilibrium, "MAX_DESCENTS", 0)
+    monkeypatch.setattr(descent, "MAX_DESCENTS", 0)
     with finished(comm, strip(1.5)) as simulation:
         assert simulation.stability == STABLE | {"stable": False, "negative_pivots": 1}
         assert "unstable" in notes(simulation)[0]

@@ -84,18 +84,18 @@ class WholeStiffness:
     def _is_stable(self, factor: float) -> bool:
         """Whether the equilibrium is stable, or stability is not known; collective."""
         with self._examine() as examination:
-            found = examination.stability
-            if found.stable is not False:
+            stability = examination.stability
+            if stability.stable is not False:
                 return True
-            return self.skew_part_stabilises(found, examination.lowest_mode(), factor)
+            return self.skew_part_stabilises(stability, examination.lowest_mode(), factor)
 
-    def skew_part_stabilises(self, found: Stability, mode: Array | None, factor: float) -> bool:
+    def skew_part_stabilises(self, stability: Stability, mode: Array | None, factor: float) -> bool:
         """Whether the skew part of the stiffness stabilises the unstable ``mode`` u of the symmetric part S.
 
         With one negative eigenvalue of S the determinant of all of the stiffness K has the sign of uᵀK⁻¹u, as
         the rest of S, and so of K, is positive definite; collective.
         """
-        if mode is None or found.negative != 1 or self._equations.active.viscous:
+        if mode is None or stability.negative != 1 or self._equations.active.viscous:
             return False
         response = self._displacement_by_force(mode, factor)
         if response is None:
