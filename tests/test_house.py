@@ -92,22 +92,6 @@ def test_imports_go_in_one_direction() -> None:
         assert upward(parsed(path), name) == [], name
 
 
-@pytest.mark.parametrize(
-    ("source", "name", "found"),
-    [
-        (
-            "def f():\n    from lyra_petsc.stepping.system import X\n",
-            "terms.wind",
-            ["line 2: lyra_petsc.stepping.system"],
-        ),
-        ("from lyra_petsc import stepping", "mesh.points", ["line 1: lyra_petsc.stepping"]),
-        ("from lyra_petsc.terms.rest import R", "linear.block_rows", []),
-    ],
-)
-def test_an_upward_import_is_found(source: str, name: str, found: list[str]) -> None:
-    assert upward(ast.parse(source), f"lyra_petsc.{name}") == found
-
-
 def test_names_of_classes_and_modules_occur_once() -> None:
     """A search for a name leads to one place."""
     names = Counter(path.stem for path in MODULES if path.name != "__init__.py")
