@@ -94,7 +94,7 @@ def drape_cloth(bench: Bench, scene: dict[str, Any], speed: float = 0.01) -> Arr
         return trial.x
 
 
-def shadow(x: Array, faces: Ints, pixels: int) -> Picture:
+def shadow(x: Array, faces: Ints, pixels: int = 240) -> Picture:
     """Pixels (pixels, pixels), rows along y, covered by the disc or by triangles of vertices x (V, 3) [m]."""
     centres = MARGIN * CLOTH * ((2.0 * np.arange(pixels) + 1.0) / pixels - 1.0)
     dark = np.hypot(centres, centres[:, None]) < DISC

@@ -50,14 +50,14 @@ def walls(
     Where two or more walls meet they share vertices and edges.
     """
     flat, faces = rectangle(n, rows, 1.0, depth, alternating=alternating)
-    each = []
+    pieces = []
     for start, end in section:
         x, z = (np.asarray(start)[:, None] + np.subtract(end, start)[:, None] * flat[:, 0]).tolist()
-        each.append(np.column_stack([x, flat[:, 1], z]))
-    vertices = np.concatenate(each)
+        pieces.append(np.column_stack([x, flat[:, 1], z]))
+    vertices = np.concatenate(pieces)
     size = np.ptp(vertices, axis=0).max()
     _, first, number = np.unique((vertices / size).round(9), axis=0, return_index=True, return_inverse=True)
-    triangles = np.concatenate([faces + k * len(flat) for k in range(len(each))])
+    triangles = np.concatenate([faces + k * len(flat) for k in range(len(pieces))])
     return vertices[first], number.ravel()[triangles]
 
 

@@ -444,9 +444,6 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     return record
 
 
-PIXELS = 240
-
-
 def _disc(cells: int, seed: int) -> tuple[Array, Ints]:
     """A disc of radius 1: a square of irregular cells, so that folds have no preferred direction."""
     flat, faces = irregular_rectangle(cells, cells, 2.0, 2.0, seed)
@@ -480,7 +477,7 @@ def cusick(bench: Bench, fabric: Fabric, degrees: float, folder: Path | None = N
             x = drape_cloth(bench, scene)
         if record.drape is None:
             record.drape, record.triangles = x, faces
-        dark = shadow(x, faces, PIXELS)
+        dark = shadow(x, faces)
         coefficients.append(100.0 * drape_coefficient(dark))
         counts.append(float(count_folds(dark)))
     record.numbers = [

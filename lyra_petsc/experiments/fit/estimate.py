@@ -243,8 +243,8 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Misfit, str
             raise failure[0] from None
         raise InputError(f"PETSc cannot: {error_message(error)}", key=culprits(error)) from None
     finally:
-        for each in (tao, matrix, start, lower, upper, values):
-            each.destroy()
+        for petsc_object in (tao, matrix, start, lower, upper, values):
+            petsc_object.destroy()
     best = min(known.values(), key=lambda evaluation: evaluation.cost)
     left = _gauss_newton_step(best, low, high)
     if left <= converged or (reason > 0 and left <= NEAR):

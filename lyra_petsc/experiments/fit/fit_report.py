@@ -35,7 +35,7 @@ def outcome_of(fitted: Fitted) -> FitOutcome:
     return FitOutcome(case, {"search": Verdict(passed, fitted.ending)}, fitted.seconds, fitted=fitted)
 
 
-def _deviation(estimate: Estimate) -> str:
+def _interval(estimate: Estimate) -> str:
     if estimate.at_bound:
         return "at its bound"
     low, high = estimate.interval
@@ -56,16 +56,15 @@ class FitView(View[FitOutcome]):
         self.ready = True
 
     def csv_rows(self, outcome: FitOutcome) -> Iterable[Mapping[str, Any]]:
-        for each in outcome.fitted.conclusion.estimates:
-            low, high = each.interval
-            numbers = each.key, each.start, each.low, each.high, each.value, each.deviation, low, high
-            yield dict(zip(self.columns, [*numbers, int(each.at_bound)], strict=True))
+        for e in outcome.fitted.conclusion.estimates:
+            numbers = e.key, e.start, e.low, e.high, e.value, e.deviation, *e.interval, int(e.at_bound)
+            yield dict(zip(self.columns, numbers, strict=True))
 
     def summary_table(self, outcomes: Sequence[FitOutcome]) -> list[Sequence[str]]:
         fitted = outcomes[0].fitted
         rows: list[Sequence[str]] = [("parameter", "start", "found", "95 % interval")]
-        for each in fitted.conclusion.estimates:
-            rows.append((each.key, f"{each.start:.5g}", f"{each.value:.5g}", _deviation(each)))
+        for estimate in fitted.conclusion.estimates:
+            rows.append((estimate.key, f"{estimate.start:.5g}", f"{estimate.value:.5g}", _interval(estimate)))
         return rows
 
     def case_content(self, outcome: FitOutcome) -> dict[str, Any]:
@@ -102,7 +101,7 @@ class FitView(View[FitOutcome]):
         report.table(
             ["parameter", "start", "found", "deviation", "95 % interval"],
             [
-                [e.key, e.start, f"{e.value:.6g}", None if e.at_bound else e.deviation, _deviation(e)]
+                [e.key, e.start, f"{e.value:.6g}", None if e.at_bound else e.deviation, _interval(e)]
                 for e in conclusion.estimates
             ],
             caption="Intervals hold for the uncertainties given, where values depend linearly on parameters.",

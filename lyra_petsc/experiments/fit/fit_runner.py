@@ -242,11 +242,11 @@ def fit_scene(
         evaluation = stored.get(numbers.tobytes())
         resumed = evaluation is not None
         if evaluation is None:
-            found = model.evaluate(numbers.tolist(), progress=lambda part: listener.progress(number, part))
-            assert found.jacobian is not None
+            values = model.evaluate(numbers.tolist(), progress=lambda part: listener.progress(number, part))
+            assert values.jacobian is not None
             # all ranks use the numbers of rank 0, bit by bit
             evaluation = comm.bcast(
-                Misfit(numbers, (found.values - target) / sigma, found.jacobian / sigma[:, None])
+                Misfit(numbers, (values.values - target) / sigma, values.jacobian / sigma[:, None])
             )
             shapes[numbers.tobytes()] = model.shape
             if number == 1:
@@ -353,16 +353,16 @@ def _read(path: Path, new: StoredEvaluations) -> StoredEvaluations:
     if not path.is_file():
         return new
     try:
-        found = load_record(path, StoredEvaluations)
+        stored = load_record(path, StoredEvaluations)
     except (OSError, ValueError):
         raise InputError("cannot be read; begin anew with --force", file=path) from None
-    if found.fingerprint != new.fingerprint:
+    if stored.fingerprint != new.fingerprint:
         raise InputError(
             "holds evaluations of another scene or other measurements; begin anew with --force, or name "
             "another folder",
             file=path,
         )
-    return found
+    return stored
 
 
 @dataclass(frozen=True)
@@ -425,10 +425,10 @@ def gradient(
         readings, values = on_root(comm, prepare)
         sizes = {key: abs(value) or 1.0 for key, value in values.items()}
         model = Model(comm, loaded, sizes, readings)
-        found = model.evaluate(list(values.values()))
-        assert found.jacobian is not None
-        columns = dict(zip(values, found.jacobian.T, strict=True))
-        return Gradient(tuple(model.labels), found.values, columns)
+        evaluation = model.evaluate(list(values.values()))
+        assert evaluation.jacobian is not None
+        columns = dict(zip(values, evaluation.jacobian.T, strict=True))
+        return Gradient(tuple(model.labels), evaluation.values, columns)
 
 
 def _quantity(quantity: Any) -> Quantity:
@@ -449,10 +449,10 @@ def _values(scene: Scene, parameters: Any) -> dict[str, float]:
             f"must be keys as in ['material.bending'], not {shown(parameters)}", key="parameters"
         )
     check_keys(scene, keys, at="parameters")
-    given = parameters if isinstance(parameters, Mapping) else {}
+    replaced = parameters if isinstance(parameters, Mapping) else {}
     values = {}
     for key in keys:
-        value = plain(given[key]) if key in given else value_of(scene, key, at="parameters")
+        value = plain(replaced[key]) if key in replaced else value_of(scene, key, at="parameters")
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InputError(f"must be a number, not {shown(value)}", key=f"parameters.{key}")
         values[key] = float(value)

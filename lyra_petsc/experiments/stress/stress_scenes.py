@@ -50,7 +50,7 @@ class Setting:
     ----------
     base : dict
         The base scene, which cases modify, as the content of a scene file.
-    given : bool
+    of_user : bool
         Whether the base scene is the user's; otherwise it is `hanging_sheet`.
     level : Scope
     size : float
@@ -60,7 +60,7 @@ class Setting:
     """
 
     base: Content
-    given: bool
+    of_user: bool
     level: Scope
     size: float = math.sqrt(2.0)
     trust_mesh: bool = False
@@ -129,7 +129,7 @@ class StressCase(Case):
 
     def content(self, setting: Setting, bench: Bench) -> Content:
         """The content of the scene, with the time step and end of the case."""
-        if self.own_scene and setting.given:
+        if self.own_scene and setting.of_user:
             raise NotApplicable("has a scene of its own")
         content = self.scene(setting, bench)
         step = self.step if self.step is not None else float(content["time"]["step"])

@@ -119,8 +119,7 @@ def _option(text: str) -> str:
 
 
 def _parse_axis(text: str) -> Axis:
-    key, equals, listed = text.partition("=")
-    key = key.strip()
+    key, equals, listed = (part.strip() for part in text.partition("="))
     if not equals or not key:
         raise InputError("must read key=value,value,…, as in dt=0.02,0.01", key=_option(text))
     path = scene_key(key)
@@ -130,9 +129,8 @@ def _parse_axis(text: str) -> Axis:
     if not all(words):
         raise InputError("has an empty value between its commas", key=_option(text))
     values = tuple(_parse_value(path, word, text) for word in words)
-    for number, value in enumerate(values):
-        if value in values[:number]:
-            raise InputError(f"has the value {words[number]} twice", key=_option(text))
+    if twice := [word for number, word in enumerate(words) if values[number] in values[:number]]:
+        raise InputError(f"has the value {twice[0]} twice", key=_option(text))
     return Axis(key, path, values)
 
 
@@ -265,12 +263,12 @@ def describe_settings(settings: Iterable[tuple[str, Value]]) -> str:
 
 def make_combinations(axes: Sequence[Axis]) -> list[Combination]:
     """All combinations, the last axis varying fastest."""
-    found = []
+    combinations = []
     for values in itertools.product(*(axis.values for axis in axes)):
         chosen = tuple(zip(axes, values, strict=True))
         title = describe_settings((axis.key, value) for axis, value in chosen) or "the scene as it is"
-        found.append(Combination(_folder_name(chosen), title, chosen=chosen))
-    return found
+        combinations.append(Combination(_folder_name(chosen), title, chosen=chosen))
+    return combinations
 
 
 # -- from values to a scene ----------------------------------------------------------------------------
@@ -284,21 +282,21 @@ def overrides(base: Scene, chosen: Choice) -> list[str]:
     InputError
         An element size for a mesh with fixed elements.
     """
-    found: list[str] = []
+    changes: list[str] = []
     for axis, value in chosen:
         if axis.path == "mesh":
-            found += mesh_overrides(base, float(value))
+            changes += mesh_overrides(base, float(value))
         else:
             whole = isinstance(value, float) and value.is_integer()
-            found.append(f"{axis.path}={int(value) if whole else value}")
-    time, given = base.time, {axis.path: value for axis, value in chosen}
-    if "time.tolerance" in given and time.step != "auto":
-        found.append("time.step=auto")
-    if given.get("time.step", "auto") != "auto" and time.tolerance is not None:
-        found.append("time.tolerance=")
-    if given.get("time.integrator", "alpha2") != "alpha2" and "time.spectral_radius" not in given:
-        found.append("time.spectral_radius=")
-    return found
+            changes.append(f"{axis.path}={int(value) if whole else value}")
+    time, values = base.time, {axis.path: value for axis, value in chosen}
+    if "time.tolerance" in values and time.step != "auto":
+        changes.append("time.step=auto")
+    if values.get("time.step", "auto") != "auto" and time.tolerance is not None:
+        changes.append("time.tolerance=")
+    if values.get("time.integrator", "alpha2") != "alpha2" and "time.spectral_radius" not in values:
+        changes.append("time.spectral_radius=")
+    return changes
 
 
 def mesh_overrides(base: Scene, size: float) -> list[str]:
@@ -311,14 +309,14 @@ def mesh_overrides(base: Scene, size: float) -> list[str]:
     """
     if not (math.isfinite(size) and size > 0.0):
         raise InputError(f"an element size must be > 0 m, not {size:g}", key="--vary mesh")
-    found = []
+    changes = []
     for number, source in enumerate(base.mesh):
         if source.grid is not None:
             grid = source.grid
             nx, ny = (max(1, round(length / size)) for length in (grid.width, grid.height))
-            found += [f"mesh[{number}].grid.nx={nx}", f"mesh[{number}].grid.ny={ny}"]
+            changes += [f"mesh[{number}].grid.nx={nx}", f"mesh[{number}].grid.ny={ny}"]
         elif source.file is not None and source.file.suffix.lower() == ".geo":
-            found.append(f"mesh[{number}].size={size!r}")
+            changes.append(f"mesh[{number}].size={size!r}")
         else:
             name = source.file.name if source.file is not None else "a mesh"
             raise InputError(
@@ -326,7 +324,7 @@ def mesh_overrides(base: Scene, size: float) -> list[str]:
                 file=base.source,
                 key="--vary mesh",
             )
-    return found
+    return changes
 
 
 def scene_of(path: str, overrides: Sequence[str], *, trust_mesh: bool = False) -> Scene:
@@ -401,7 +399,7 @@ def parse_quantities(text: str, probes: Iterable[str]) -> list[StudyQuantity]:
     known = {quantity.probe: [quantity] for quantity in every}
     known |= {"position": [*POSITION], "energy": [ENERGY], "probes": every}
     words = [word.strip() for word in text.split(",")] if text.strip() else ["position", "energy", "probes"]
-    found: list[StudyQuantity] = []
+    quantities: list[StudyQuantity] = []
     for word in words:
         if not word:
             raise InputError("has an empty name between its commas", key=key)
@@ -409,10 +407,10 @@ def parse_quantities(text: str, probes: Iterable[str]) -> list[StudyQuantity]:
             raise InputError(f"unknown quantity '{word}', {suggest(word, known)}", key=key)
         if not known[word] and text.strip():
             raise InputError("the scene has no probes; add some, as in probes: {tip: {group: tip}}", key=key)
-        if any(quantity in found for quantity in known[word]):
+        if any(quantity in quantities for quantity in known[word]):
             raise InputError(f"names '{word}' twice", key=key)
-        found += known[word]
-    return found
+        quantities += known[word]
+    return quantities
 
 
 REQUEST_FILE = "request.json"
@@ -459,8 +457,8 @@ class Request:
         InputError
             If the settings contradict each other.
         """
-        given = (*self.settings, *REDUCED_OUTPUT, *overrides)
-        return scene_of(self.scene, given, trust_mesh=self.trust_mesh)
+        settings = (*self.settings, *REDUCED_OUTPUT, *overrides)
+        return scene_of(self.scene, settings, trust_mesh=self.trust_mesh)
 
 
 def read_request(folder: Path) -> Request:
@@ -671,12 +669,12 @@ def _check_each_value(request: Request, base: Scene, axis: Axis) -> None:
     """Check each value by itself; conflicts between axes are reported in the rows of combinations."""
     seen: dict[tuple[str, ...], Value] = {}
     for value in axis.values:
-        found = overrides(base, [(axis, value)])
+        changes = overrides(base, [(axis, value)])
         try:
-            request.with_changes(found)
+            request.with_changes(changes)
         except InputError:
             # a spectral radius may be valid only together with values of other axes
             if len(request.vary) <= 1 or axis.path != "time.spectral_radius":
                 raise
-        if axis.path == "mesh" and (other := seen.setdefault(tuple(found), value)) != value:
+        if axis.path == "mesh" and (other := seen.setdefault(tuple(changes), value)) != value:
             raise InputError(f"{other:g} and {value:g} m give the same grid", key=f"--vary {axis.key}")

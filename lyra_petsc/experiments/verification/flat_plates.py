@@ -20,7 +20,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import SIDES, irregular_rectangle, rectangle, rectangle_script, side_edges
-from lyra_petsc.experiments.verification.verification_case import grid, isotropic, scene
+from lyra_petsc.experiments.verification.verification_case import G, grid, isotropic, scene
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.parallel import on_root
@@ -97,8 +97,8 @@ def hinged_strip(pattern: str, n: float, membrane: float = MEMBRANE, **more: Any
     return scene(mesh, material | more.pop("material", {}), handles=held, **more)
 
 
-LENGTH, WIDTH, STIFFNESS, G = 1.0, 0.1, 1000.0, 9.81
-"""Length [m], width [m], membrane stiffness [N/m], gravity [m/s²] of hanging strips"""
+LENGTH, WIDTH, STIFFNESS = 1.0, 0.1, 1000.0
+"""Length [m], width [m], membrane stiffness [N/m] of hanging strips"""
 
 
 def arc(s: Array, span: float) -> Array:
@@ -163,10 +163,10 @@ class SmallMotions:
         """Displacements (V, 3) [m] under small forces (V, 3) [N]."""
         from scipy.sparse.linalg import spsolve
 
-        forces, found = np.zeros((2, len(self.mass)))
+        forces, unknowns = np.zeros((2, len(self.mass)))
         forces[self.vertices] = force
-        found[self.free] = spsolve(self.stiffness_of_free, forces[self.free])
-        return found[self.vertices]
+        unknowns[self.free] = spsolve(self.stiffness_of_free, forces[self.free])
+        return unknowns[self.vertices]
 
 
 def small_motions(trial: Trial) -> SmallMotions:

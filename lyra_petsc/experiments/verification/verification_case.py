@@ -185,6 +185,9 @@ def load_data(name: str) -> dict[str, Any]:
 
 STATIC: dict[str, Any] = {"analysis": "static"}
 FLOOR: dict[str, Any] = {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
+G = 9.81
+"""Gravity [m/s²]"""
+
 ASSEMBLED = {"end": 1.0, "step": 1.0}
 """Time block of a scene that is set up but not stepped."""
 

@@ -33,8 +33,8 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     scale,
 )
 from lyra_petsc.experiments.stress.verdicts import RunRecord
-from lyra_petsc.experiments.verification.flat_plates import LENGTH, WIDTH, G, hung
-from lyra_petsc.experiments.verification.verification_case import grid, isotropic, scene
+from lyra_petsc.experiments.verification.flat_plates import LENGTH, WIDTH, hung
+from lyra_petsc.experiments.verification.verification_case import G, grid, isotropic, scene
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import default_scene, load_scene

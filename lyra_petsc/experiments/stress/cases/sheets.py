@@ -33,7 +33,7 @@ from lyra_petsc.terms.stretch import SOFTENS_BELOW
 def product(setting: Setting, bench: Bench, **factors: float) -> Content:
     """The base scene with several factors; the default base scene with a coarser mesh."""
     content = setting.content()
-    if not setting.given:
+    if not setting.of_user:
         content |= {key: hanging_sheet(CELLS[Scope.QUICK])[key] for key in ("mesh", "handles")}
     return scale(content, **factors)
 
@@ -100,7 +100,7 @@ def mirrored(x: Array, spacing: float) -> Array:
 def dome(setting: Setting, bench: Bench) -> Content:
     """A dome held at its rim; for a given scene its own sheet without handles."""
     content = setting.content()
-    if setting.given:
+    if setting.of_user:
         return remove_handles(content)
     n = CELLS[setting.level]
     vertices, triangles = rectangle(n, n, 1.0, 1.0)
@@ -170,7 +170,7 @@ def turn_handles(content: Content) -> Content:
 def pull(setting: Setting, bench: Bench, to: float) -> Content:
     """Scale the positions of handles along x; in the default base scene both sides are held."""
     content = setting.content()
-    if not setting.given:
+    if not setting.of_user:
         content["handles"] = [dict(side) for side in SIDES]
     end = 0.75 * STEPS * setting.step
     return move_handles(content, [{"time": 0.0}, {"time": end, "scale": [to, 1.0, 1.0]}])

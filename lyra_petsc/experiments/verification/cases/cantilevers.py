@@ -36,6 +36,7 @@ from lyra_petsc.experiments.verification.rods import (
 from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     STATIC,
+    G,
     Measured,
     isotropic,
     scene,
@@ -194,10 +195,10 @@ def coiling_strip(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- cantilever test of cloth ----------------------------------------------------------------------------
 
-BENDING_LENGTH, CLOTH_DENSITY, GRAVITY = 0.02, 0.15, 9.81
-"""Bending length c [m], density [kg/m²], gravity [m/s²]; the rigidity is w c³ with weight w [N/m²]."""
+BENDING_LENGTH, CLOTH_DENSITY = 0.02, 0.15
+"""Bending length c [m], density [kg/m²]; the rigidity is w c³ with weight w [N/m²]."""
 
-RIGIDITY = CLOTH_DENSITY * GRAVITY * BENDING_LENGTH**3
+RIGIDITY = CLOTH_DENSITY * G * BENDING_LENGTH**3
 
 
 def _overhangs(
@@ -219,7 +220,7 @@ def cloth_overhang(bench: Bench, n: float) -> Iterator[Measured]:
             # corrects the known effective stiffness of the mesh
             "bending": RIGIDITY / strip.stiffness,
         }
-        scene = strip.scene(material=material, gravity=[0, 0, -GRAVITY])
+        scene = strip.scene(material=material, gravity=[0, 0, -G])
         scene["mesh"]["grid"] |= {"width": overhang, "height": overhang * strip.width}
         return scene
 
@@ -229,7 +230,7 @@ def cloth_overhang(bench: Bench, n: float) -> Iterator[Measured]:
 def elastica_overhang(bench: Bench, n: float) -> Iterator[Measured]:
     def cloth(strip: Strip, overhang: float) -> dict[str, Any]:
         material = plate_material(MEMBRANE * RIGIDITY / overhang**2, RIGIDITY) | {"density": CLOTH_DENSITY}
-        return strip.scene(length=overhang, material=material, gravity=[0, 0, -GRAVITY])
+        return strip.scene(length=overhang, material=material, gravity=[0, 0, -G])
 
     angles = {"one cell": (7.1, 41.5), "0.1 L": (45.0,), "0.25 L": (41.5,)}
     return _overhangs(bench, directed(bench, n, angles), cloth)

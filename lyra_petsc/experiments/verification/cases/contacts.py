@@ -15,6 +15,7 @@ from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle
 from lyra_petsc.experiments.verification.verification_case import (
     FLOOR,
     STATIC,
+    G,
     Measured,
     grid,
     isotropic,
@@ -25,18 +26,17 @@ from lyra_petsc.experiments.verification.verification_case import (
 from lyra_petsc.output.fields import FIELDS
 from lyra_petsc.terms.term import Elastic
 
-G = 9.81
 SLOPES = (5.0, 30.0, 60.0)
 SLIDING = (0.99, 0.9, 0.5)
 """Coefficients of friction over the tangent of the slope angle, for sliding."""
 
 STICKS = 1.01
-GAP, STEP = 0.01, 0.01
+STEP = 0.01
 CLEAR, SIDE = 0.94, 0.4
 """Initial distance over the gap, near the equilibrium distance; side of a sheet [m]"""
 
-SETTLED, END, SLID = 1.0, 3.0, 1.5
-"""Times [s]: when a sticking sheet has settled, end of its simulation, end for a sliding sheet."""
+SETTLED = 1.0
+"""Time [s] when a sticking sheet has settled."""
 
 
 def placed(mesh: dict[str, Any], shift: Sequence[float], degrees: float = 0.0) -> dict[str, Any]:
@@ -63,9 +63,10 @@ def sheet_on_slope(
 ) -> dict[str, Any]:
     """A free sheet on a slope."""
     _, _, normal = slope_of(degrees)
+    gap = 0.01
     return cloth(
-        placed(grid(SIDE, SIDE, cells, cells, "alternating"), (CLEAR * GAP * normal).tolist(), degrees),
-        {"gap": GAP, "friction": friction, "self": False},
+        placed(grid(SIDE, SIDE, cells, cells, "alternating"), (CLEAR * gap * normal).tolist(), degrees),
+        {"gap": gap, "friction": friction, "self": False},
         {"end": end, "step": STEP, "integrator": integrator},
         obstacles={"slope": {"plane": {"point": [0.0, 0.0, 0.0], "normal": normal.tolist()}}},
     )
@@ -87,17 +88,18 @@ def _creep(trial: Trial, down: Array) -> float:
 
 def incline(bench: Bench, n: float) -> Sequence[Measured]:
     creep, accelerations, friction_error = 0.0, [], 0.0
+    end = 1.5  # of the simulation of a sliding sheet
     for degrees, triangles in (*((degrees, False) for degrees in SLOPES), (SLOPES[1], True)):
         angle, down, _ = slope_of(degrees)
         slope = {"obstacles": {"slope": _roof(bench, degrees)}} if triangles else {}
         for integrator in ("beuler", "midpoint") if degrees == SLOPES[0] else ("beuler",):
-            sticks = sheet_on_slope(degrees, STICKS * math.tan(angle), round(n), END, integrator)
+            sticks = sheet_on_slope(degrees, STICKS * math.tan(angle), round(n), 3.0, integrator)
             with bench.simulation(sticks | slope) as trial:
                 creep = max(creep, _creep(trial, down))
         for part in SLIDING[1:2] if triangles else SLIDING:
             friction = part * math.tan(angle)
-            with bench.simulation(sheet_on_slope(degrees, friction, round(n), SLID) | slope) as trial:
-                before, weight = trial.run_to(0.5 * SLID).v, G * float(trial.mass.sum())
+            with bench.simulation(sheet_on_slope(degrees, friction, round(n), end) | slope) as trial:
+                before, weight = trial.run_to(0.5 * end).v, G * float(trial.mass.sum())
                 while not trial.simulation.finished:
                     trial.step()
                     along = float(trial.simulation.energy_balance.obstacle_forces(1)[0, :3] @ down)
@@ -105,7 +107,7 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
                     friction_error = max(friction_error, error)
                 change = (trial.v - before) @ down
             exact = G * (1.0 - part) * math.sin(angle)
-            acceleration = float(change.mean()) / (0.5 * SLID)
+            acceleration = float(change.mean()) / (0.5 * end)
             accelerations.append([Measured("acceleration", acceleration, exact, "m/s²")])
     return [
         Measured("creep", creep, 0.0, "m", scale=1.0),
@@ -216,10 +218,6 @@ def capstan(bench: Bench, n: float) -> Iterator[Measured]:
 # -- sheets thrown at each other -------------------------------------------------------------------------
 
 
-THROWS = (("beuler", 0.0), ("bdf2", 0.0), ("midpoint", 0.0), ("beuler", 0.3), ("midpoint", 0.3))
-"""Integrators and coefficients of friction"""
-
-
 def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> dict[str, float]:
     """Largest violations of balances over all steps of a collision, by name; collective.
 
@@ -277,7 +275,8 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> dict[st
 
 
 def collision(bench: Bench, n: float) -> Iterator[Measured]:
-    for integrator, friction in THROWS:
+    throws = (("beuler", 0.0), ("bdf2", 0.0), ("midpoint", 0.0), ("beuler", 0.3), ("midpoint", 0.3))
+    for integrator, friction in throws:
         for name, value in _thrown(bench, integrator, friction, n).items():
             with_friction = ", with friction" if friction and "friction" not in name else ""
             yield Measured(f"{name}, {integrator}{with_friction}", value, 0.0, scale=1.0)
@@ -285,32 +284,34 @@ def collision(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- a block of layers -----------------------------------------------------------------------------------
 
-LAYERS, WIDE, NARROW, LAYER_GAP = 3, 0.4, 0.3, 0.002
-"""Number of lower sheets, their side, the side of the top sheet, the gap [m]"""
+LAYER_GAP = 0.002
+"""Gap [m] between sheets"""
 
 
 def layers(bench: Bench, n: float) -> Iterator[Measured]:
+    # number of lower sheets, their side and that of the top sheet [m]
+    lower, wide, narrow = 3, 0.4, 0.3
     # cells along a side, different so that vertices do not lie on vertices
     wide_cells, narrow_cells = 6, 5
     # μ between sheets, initial speed of the top sheet [m/s], time for settling before [s]
     friction, push, settle = 0.3, 0.8, 0.4
 
     def sheet(side: float, cells: int, number: int) -> dict[str, Any]:
-        shift = [0.01 * (side < WIDE), 0.5 * (WIDE - side), CLEAR * LAYER_GAP * (number + 1)]
+        shift = [0.01 * (side < wide), 0.5 * (wide - side), CLEAR * LAYER_GAP * (number + 1)]
         return placed(grid(side, side, cells, cells, "alternating"), shift)
 
-    part = NARROW**2 / (NARROW**2 + LAYERS * WIDE**2)
+    part = narrow**2 / (narrow**2 + lower * wide**2)
     deceleration = friction * G / (1.0 - part)
     content = cloth(
-        [*(sheet(WIDE, wide_cells, number) for number in range(LAYERS)), sheet(NARROW, narrow_cells, LAYERS)],
+        [*(sheet(wide, wide_cells, number) for number in range(lower)), sheet(narrow, narrow_cells, lower)],
         {"gap": LAYER_GAP, "friction": friction},
         {"end": settle + 1.4 * push / deceleration, "step": 1.0 / n},
         obstacles={"floor": FLOOR | {"friction": 0.0}},
     )
     with bench.simulation(content) as trial:
         trial.run_to(settle)
-        number = np.minimum(np.arange(len(trial.start)) // (wide_cells + 1) ** 2, LAYERS)
-        top, mass, before = number == LAYERS, trial.mass, trial.x[:, 0]
+        number = np.minimum(np.arange(len(trial.start)) // (wide_cells + 1) ** 2, lower)
+        top, mass, before = number == lower, trial.mass, trial.x[:, 0]
         trial.set_state(v=np.where(top[:, None], [push, 0.0, 0.0], 0.0))
         work = trial.simulation.budget.external_work
         moved, v = trial.run().x[:, 0] - before, trial.v[:, 0]
@@ -325,16 +326,17 @@ def layers(bench: Bench, n: float) -> Iterator[Measured]:
 # -- a sheet on a sheet -----------------------------------------------------------------------------------
 
 SLIDERS = ("beuler", "bdf2", "alpha2", "midpoint")
-LEAN, BED, BEGIN, RAN = 30.0, (1.6, 0.6), 0.2, 0.5
-"""Slope [°], size of the lower sheet [m], times [s] between which the acceleration is measured"""
+LEAN = 30.0
+"""Slope [°]"""
 
 
 def _sheet_on_sheet(n: int, friction: float, integrator: str, end: float) -> tuple[dict[str, Any], int]:
     """A sheet of n cells a side on a larger, fixed one with another mesh; number of vertices of that one."""
     cells = round(2.3 * n), round(0.87 * n)
     _, down, normal = slope_of(LEAN)
-    shift = 0.1 * down + CLEAR * LAYER_GAP * normal + [0.0, 0.5 * (BED[1] - SIDE), 0.0]
-    lower = placed(grid(*BED, *cells, "diagonal"), [0.0, 0.0, 0.0], LEAN)
+    bed = 1.6, 0.6  # size of the lower sheet [m]
+    shift = 0.1 * down + CLEAR * LAYER_GAP * normal + [0.0, 0.5 * (bed[1] - SIDE), 0.0]
+    lower = placed(grid(*bed, *cells, "diagonal"), [0.0, 0.0, 0.0], LEAN)
     upper = placed(grid(SIDE, SIDE, n, n, "alternating"), shift.tolist(), LEAN)
     count = (cells[0] + 1) * (cells[1] + 1)
     return cloth(
@@ -350,13 +352,13 @@ def sheets(bench: Bench, n: float) -> Iterator[Measured]:
     for integrator in SLIDERS:
         accelerations = []
         for part in SLIDING[1:]:
-            content, count = _sheet_on_sheet(round(n), part * math.tan(angle), integrator, RAN)
+            content, count = _sheet_on_sheet(round(n), part * math.tan(angle), integrator, 0.5)
             with bench.simulation(content) as trial:
                 mass = trial.mass[count:]
-                before, begin = trial.run_to(BEGIN).v[count:] @ down, trial.simulation.time
+                before, begin = trial.run_to(0.2).v[count:] @ down, trial.simulation.time
                 change = trial.run().v[count:] @ down - before
             exact = G * (1.0 - part) * math.sin(angle)
-            measured = float(mass @ change) / mass.sum() / (RAN - begin)  # steps may have been cut
+            measured = float(mass @ change) / mass.sum() / (0.5 - begin)  # steps may have been cut
             accelerations.append([Measured(f"acceleration, {integrator}", measured, exact, "m/s²")])
         yield from worst(accelerations)
         content, count = _sheet_on_sheet(round(n), STICKS * math.tan(angle), integrator, 2.0 * SETTLED)

@@ -36,10 +36,6 @@ from lyra_petsc.experiments.verification.verification_case import (
 RUCK = load_data("ruck")
 
 
-LONG_STEP, STEPS = 1.0, 8
-"""Δt over √(l/g), long so that backward Euler damps the motion; steps in which the end moves, then rests."""
-
-
 def _small_ruck(s: Array, half_length: float, height: float) -> Array:
     """Positions (n, 2) of a ruck with small slopes at arc length s from its middle: w'''' + k² w'' = −1."""
     k = 4.493409457909064 / half_length  # tan z = z
@@ -55,6 +51,8 @@ def _small_ruck(s: Array, half_length: float, height: float) -> Array:
 def ruck(bench: Bench, n: float) -> Iterator[Measured]:
     # half the length of the sheet over l, gap over l, C l²/B
     half, ruck_gap, membrane = 3.0, 1e-4, 1e4
+    # Δt over √(l/g), long so that backward Euler damps the motion; steps in which the end moves, then rests
+    step, steps = 1.0, 8
     cells = round(n)
     flat, faces = rectangle(cells, 1, half, half / n)
     along, rows = flat[:, 0], RUCK["rows"]
@@ -65,7 +63,7 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
         # includes the elastic shortening by the force
         displacement = half * (1.0 - force / membrane) - 0.5 * shortening - float(start[:, 0].max())
         begin = frames[-1]["time"]
-        for time in (begin + STEPS * LONG_STEP, begin + 2 * STEPS * LONG_STEP):
+        for time in (begin + steps * step, begin + 2 * steps * step):
             frames.append({"time": time, "translate": [displacement, 0.0, 0.0]})
     ends = [[0, cells + 1], [cells, 2 * cells + 1]]
     content = scene(
@@ -73,7 +71,7 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
             np.column_stack([start[:, 0], flat[:, 1], start[:, 1] + 0.95 * ruck_gap]), faces, rest=flat[:, :2]
         ),
         plate_material(membrane),
-        {"end": frames[-1]["time"], "step": LONG_STEP},
+        {"end": frames[-1]["time"], "step": step},
         gravity=[0.0, 0.0, -1.0],
         handles=[
             {"nodes": ends[0], "symmetry": "x"},
@@ -102,12 +100,6 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
 # -- against a pole, over an edge ------------------------------------------------------------------------
 
 
-FABRIC = {"density": 0.2, "membrane": isotropic(200.0), "bending": 2e-4}
-
-ALONG_Y = [-1.0, 1.0]
-"""Extent of the obstacles along y; the strips are one cell wide and stay in the xz plane"""
-
-
 def _refined(
     bench: Bench,
     n: float,
@@ -125,6 +117,7 @@ def _refined(
     """
     # length of a strip [m]; cells along it, Δt [s] and gap [m], of which one at a time is refined
     length, coarse_cells, coarse_step, coarse_gap = 0.3, 12, 0.004, 0.002
+    fabric = {"density": 0.2, "membrane": isotropic(200.0), "bending": 2e-4}
     falls = {
         "gravity": [0, 0, -9.81],
         "handles": [*held, {"group": "sheet", "axes": ["y"]}],
@@ -141,7 +134,7 @@ def _refined(
             cells = round(coarse_cells * part) if label == "h" else coarse_cells
             strip = scene(
                 placed(grid(length, length / cells, cells, 1, "alternating"), shift(gap), degrees),
-                FABRIC,
+                fabric,
                 {"end": end, "step": step},
                 contact={"gap": gap, "self": False, "friction": friction},
                 **falls,
@@ -153,14 +146,13 @@ def _refined(
 
 
 def pole(bench: Bench, n: float) -> Iterator[Measured]:
-    low, high = ([-0.03, y, -0.15] for y in ALONG_Y)
+    low, high = ([-0.03, y, -0.15] for y in (-1.0, 1.0))
     obstacles = {"pole": {"capsule": {"from": low, "to": high, "radius": 0.02}}}
     yield from _refined(bench, n, 0.3, lambda gap: [0.0, 0.0, 0.0], 30.0, [{"group": "left"}], obstacles)
 
 
 def table_edge(bench: Bench, n: float) -> Iterator[Measured]:
-    low, high = ALONG_Y
-    obstacles = {"table": {"box": {"min": [-1.0, low, -0.5], "max": [0.0, high, 0.0]}}}
+    obstacles = {"table": {"box": {"min": [-1.0, -1.0, -0.5], "max": [0.0, 1.0, 0.0]}}}
 
     def on_it(gap: float) -> list[float]:
         return [-0.13, 0.0, 0.95 * gap]
@@ -171,12 +163,6 @@ def table_edge(bench: Bench, n: float) -> Iterator[Measured]:
 # -- Cusick's drape test ---------------------------------------------------------------------------------
 
 MESHES = ("diagonal", "alternating", "irregular", "rings")
-PIXELS = 240
-RIM, WAVES = 1e-3, range(2, 10)
-"""Amplitude [m] of each initial wave along the rim, and numbers of waves around it.
-
-With 4 mm cloths are stretched so much where they are lifted that they may jump off the disc.
-"""
 
 
 def _disc(kind: str, n: int, random: np.random.Generator) -> tuple[Array, Ints]:
@@ -200,10 +186,15 @@ def _disc(kind: str, n: int, random: np.random.Generator) -> tuple[Array, Ints]:
 def _wavy(flat: Array, random: np.random.Generator) -> Array:
     """Positions [m] of a cloth with random waves outside the disc, which determine its folds."""
     radius, angle = CLOTH * np.hypot(flat[:, 0], flat[:, 1]), np.arctan2(flat[:, 1], flat[:, 0])
+    # amplitude [m] of a wave along the rim, and numbers of waves around it; with 4 mm cloths are stretched so
+    # much where they are lifted that they may jump off the disc
+    rim, numbers = 1e-3, range(2, 10)
     outside = np.maximum(0.0, (radius - DISC) / (CLOTH - DISC)) ** 2
-    parts = random.normal(size=(len(WAVES), 2))
-    waves = sum(a * np.cos(m * angle) + b * np.sin(m * angle) for m, (a, b) in zip(WAVES, parts, strict=True))
-    return CLOTH * flat + np.outer(RIM * outside * (waves - np.min(waves)), [0.0, 0.0, 1.0])
+    parts = random.normal(size=(len(numbers), 2))
+    waves = sum(
+        a * np.cos(m * angle) + b * np.sin(m * angle) for m, (a, b) in zip(numbers, parts, strict=True)
+    )
+    return CLOTH * flat + np.outer(rim * outside * (waves - np.min(waves)), [0.0, 0.0, 1.0])
 
 
 def _drape(bench: Bench, kind: str, n: int, start: int) -> float:
@@ -216,7 +207,7 @@ def _drape(bench: Bench, kind: str, n: int, start: int) -> float:
     # gap [m], below the shortest edge of the finest mesh; speed [m/s] below which a cloth counts as at rest
     scene = drape_scene(bench, lifted, faces, rest, material, start, 1e-3, iterations=200)
     x = drape_cloth(bench, scene, 1e-3)
-    return drape_coefficient(shadow(x, faces, PIXELS))
+    return drape_coefficient(shadow(x, faces))
 
 
 def scatter_of_means(samples: Sequence[Sequence[float]]) -> float:

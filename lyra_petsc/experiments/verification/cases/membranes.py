@@ -4,6 +4,7 @@ hanging membranes.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -19,6 +20,7 @@ from lyra_petsc.experiments.verification.rods import stretches
 from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     STATIC,
+    G,
     Measured,
     grid,
     isotropic,
@@ -43,9 +45,6 @@ GRADIENTS = [
 GRADIENTS += [np.array([[1.0, 0.3], [0.0, 1.0]]), np.array([[1.07, 0.11], [-0.05, 0.93]])]
 GRADIENTS += [np.array([[math.cos(TURN), -math.sin(TURN)], [math.sin(TURN), math.cos(TURN)]]) @ GRADIENTS[3]]
 """Plane deformation gradients F: stretches, simple shear, a general one, a rotation of stretches."""
-
-PULLS = {"isotropic": (1.01, 1.1, 1.5, 2.0), "orthotropic": (1.01, 1.1, 1.5), "nu = 0": (1.01, 1.1, 1.5, 2.0)}
-"""Stretches in the direction of the pull"""
 
 BASE, HEIGHT = 1.0, 0.7
 """Sides of the sheet [m]"""
@@ -118,7 +117,9 @@ def uniaxial_pull(bench: Bench, n: float) -> Iterator[Measured]:
         {"nodes": [0], "axes": ["y"]},
         {"box": [[-1, -1, -1], [2, 2, 1]], "axes": ["z"]},
     ]  # fmt: skip
-    for material, along in ((material, along) for material, some in PULLS.items() for along in some):
+    for material, along in itertools.product(MATERIALS, (1.01, 1.1, 1.5, 2.0)):
+        if material == "orthotropic" and along == 2.0:
+            continue  # it would contract to nothing
         c, strain = MATERIALS[material], 0.5 * (along**2 - 1.0)
         across = math.sqrt(1.0 - 2.0 * c["c12"] / c["c22"] * strain)
         pull = along * (c["c11"] - c["c12"] ** 2 / c["c22"]) * strain
@@ -137,9 +138,6 @@ def uniaxial_pull(bench: Bench, n: float) -> Iterator[Measured]:
         yield Measured(f"largest displacement off, {name}", off, 0.0, "m", BASE)
         yield Measured(f"force per width, {name}", per_width, pull, "N/m")
 
-
-G = 9.81
-"""Gravity [m/s²]"""
 
 # -- a round membrane ------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.verification.verification_case import (
+    G,
     Measured,
     grid,
     isotropic,
@@ -20,9 +21,6 @@ from lyra_petsc.experiments.verification.verification_case import (
 )
 
 # -- falls -----------------------------------------------------------------------------------------------
-
-G = 9.81
-"""m/s²"""
 
 
 def _sheet(nx: int, n: float, end: float, density: float, **more: Any) -> dict[str, Any]:
