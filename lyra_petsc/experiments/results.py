@@ -57,8 +57,6 @@ class View(ABC, Generic[O]):
     verb : str
     title : str
         Title of the page.
-    pictures : str
-        Name of the figures, for the note that the page lacks them without the plotting packages.
     columns : sequence of str
         Columns of the CSV file.
     entry : str
@@ -69,7 +67,6 @@ class View(ABC, Generic[O]):
 
     verb: ClassVar[str]
     title: str
-    pictures: str = ""
     columns: Sequence[str]
     entry: ClassVar[str] = "case"
     ready: bool = True
@@ -130,7 +127,7 @@ class View(ABC, Generic[O]):
 
     def close_page(self, report: Report, folder: Path, command: Sequence[str]) -> str:
         """Add command and versions and write the page, on one rank; returns a note on missing packages."""
-        return write_report(report, folder, library_versions(), command, pictures=self.pictures)
+        return write_report(report, folder, library_versions(), command, pictures="pictures")
 
 
 def _all_passed(outcomes: Sequence[O]) -> bool | None:

@@ -124,7 +124,6 @@ class FabricView(View[FabricOutcome]):
 
     verb = "fabric"
     entry = "test"
-    pictures = "plots"
     columns = ("test", "quantity", "value", "scatter", "unit", "status", "problem")
 
     def __init__(self, material: str) -> None:

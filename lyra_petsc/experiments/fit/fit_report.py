@@ -46,7 +46,6 @@ class FitView(View[FitOutcome]):
     """Report of one fit."""
 
     verb = "fit"
-    pictures = "pictures"
     columns = ("parameter", "start", "lowest", "highest", "value", "deviation", "from", "to", "at_bound")
 
     def __init__(self, title: str) -> None:

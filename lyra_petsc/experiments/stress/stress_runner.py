@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,8 +27,7 @@ from lyra_petsc.experiments.stress.verdicts import (
     ratio,
 )
 from lyra_petsc.kernels.compilation import COMPILATION
-from lyra_petsc.show.report.document import PLOTS, Report, seconds, short
-from lyra_petsc.show.report.plots import Series, over_time, surface
+from lyra_petsc.show.report.document import Report, seconds, short
 
 TIME_LIMIT = {Scope.QUICK: 20.0, Scope.USUAL: 60.0, Scope.FULL: 600.0}
 """CPU time [s], without the compilation of kernels, after which a case is stopped between two steps."""
@@ -185,8 +183,6 @@ def _run_steps(trial: Trial, case: StressCase, record: RunRecord, deadline: floa
     """Fill the record, step by step to the end or until `_own_seconds` of rank 0 reach a deadline."""
     simulation = trial.simulation
     comm = simulation.comm
-    mesh = simulation.problem.mesh
-    record.triangles = mesh.triangles if mesh is not None else None
     if case.shape is not None:
         shape = case.shape(trial.x, simulation.problem.whole.spacing)
         trial.set_state(x=shape)
@@ -213,21 +209,9 @@ def _run_steps(trial: Trial, case: StressCase, record: RunRecord, deadline: floa
                 recorder.record_state()
             if case.observe is not None:
                 record.observed.append(case.observe(trial))
-    except SolverError as error:
-        if error.collective or comm.size == 1:
-            record.last = _root_positions(trial)
-        raise
     finally:
         record.notes = list(simulation.notes)
         record.balance = simulation.guard.content() if simulation.guard is not None else {}
-    # for the figures: gathered once per case, freed when worse cases follow
-    record.last = _root_positions(trial)
-
-
-def _root_positions(trial: Trial) -> Array | None:
-    """Positions (V, 3) [m] on rank 0, None elsewhere."""
-    x = trial.x
-    return x if trial.simulation.comm.rank == 0 else None
 
 
 def launched(launcher: Launcher, case: StressCase, arguments: Sequence[str], watch: Watch) -> StressOutcome:
@@ -252,10 +236,6 @@ def launched(launcher: Launcher, case: StressCase, arguments: Sequence[str], wat
         return StressOutcome(case, **vars(saved))
     record = RunRecord(case.steps, stop_reason=message)
     return StressOutcome(case, judge_physics(record), record=record)
-
-
-MAX_FIGURES = 6
-"""Number of the worst cases whose figures the page shows."""
 
 
 def csv_row(outcome: StressOutcome) -> dict[str, Any]:
@@ -334,7 +314,6 @@ class StressView(View[StressOutcome]):
 
     verb = "stress"
     title = "Stress: stiff and extreme cases"
-    pictures = "pictures"
     columns = tuple(csv_row(StressOutcome(StressCase("", "", base_scene))))
 
     def __init__(self, setting: Setting, count: int) -> None:
@@ -359,11 +338,6 @@ class StressView(View[StressOutcome]):
             passed = f"{sum(outcome.passed for outcome in mine)} of {len(mine)}"
             table.append((family, passed, f"{sum(outcome.seconds for outcome in mine):.1f}"))
         return table
-
-    def case_ended(self, outcomes: Sequence[StressOutcome]) -> None:
-        """Free the final shapes of cases that the page will not show, since there are worse ones."""
-        for outcome in sorted(outcomes, key=severity, reverse=True)[MAX_FIGURES:]:
-            outcome.record.last = outcome.record.triangles = None
 
     def csv_rows(self, outcome: StressOutcome) -> Iterable[Mapping[str, Any]]:
         yield csv_row(outcome)
@@ -402,12 +376,9 @@ class StressView(View[StressOutcome]):
         if failed:
             report.heading("What failed")
             report.bullets(failed)
-        report.heading("The worst cases")
-        for outcome in run[:MAX_FIGURES]:
-            report.paragraph(f"{outcome.case.name}: {outcome.case.title}.")
-            report.bullets(outcome.record.notes)
-            if plots:
-                _figures(report, outcome)
+        report.heading("Notes of the runs")
+        for outcome in run:
+            report.bullets([f"{outcome.case.name}: {note}" for note in outcome.record.notes])
         report.heading("What was judged")
         judged = [
             [one.case.name, name, verdict.line] for one in run for name, verdict in one.verdicts.items()
@@ -429,22 +400,3 @@ def _aligned_cells(texts: Sequence[str]) -> str:
     widths = [max(len(name), minimum) for name, (minimum, _) in HEADINGS.items()]
     first, *others = zip(texts, widths, strict=True)
     return "  ".join([first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]).rstrip()
-
-
-def _figures(report: Report, outcome: StressOutcome) -> None:
-    """Add figures of the last shape, and of the energy over time with the work done."""
-    case, record = outcome.case, outcome.record
-    if record.last is not None and record.triangles is not None:
-        when = f"t = {seconds(record.times[-1])}" if record.times else "the start"
-        caption, name = f"{case.name}: {case.title}, {when}", f"{PLOTS}/{case.name}-shape"
-        report.figure(surface(record.last, record.triangles, name=name, caption=caption))
-    if len(record.times) > 1:
-        times = [0.0, *record.times]
-        curves = [Series("kinetic + potential", times, [record.start_energy, *record.energies])]
-        if record.balances and record.integrator == "beuler":
-            work = itertools.accumulate(
-                (one.account.external for one in record.balances), initial=record.start_energy
-            )
-            curves.append(Series("energy at the start + work done", times, list(work)))
-        caption, name = f"{case.name}: energy over time", f"{PLOTS}/{case.name}-energy"
-        report.figure(over_time(curves, name=name, caption=caption, y_label="energy [J]"))

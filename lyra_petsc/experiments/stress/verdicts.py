@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lyra_petsc.experiments.case import StoredArray, Verdict
+from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.stress.step_balance import StepBalance
 from lyra_petsc.show.report.document import short
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
@@ -52,10 +52,6 @@ class RunRecord:
         Energy balance of the whole run, as in summary.json; empty if nothing ran.
     cpu_seconds : list of float
         CPU time of each step [s], the maximum over ranks.
-    last : (V, 3) array or None
-        Positions [m] after the last step, on rank 0; None if they were not gathered or have been freed.
-    triangles : (F, 3) array or None
-        Vertices of the triangles, on rank 0.
     """
 
     planned: int = 0
@@ -71,8 +67,6 @@ class RunRecord:
     integrator: str = "beuler"
     balance: dict[str, Any] = field(default_factory=dict)
     cpu_seconds: list[float] = field(default_factory=list)
-    last: StoredArray | None = None
-    triangles: StoredArray | None = None
 
     @property
     def newton(self) -> list[int]:

@@ -315,7 +315,6 @@ class VerificationView(View[VerificationOutcome]):
 
     verb = "verify"
     title = "Verification: exact and published answers"
-    pictures = "plots"
     columns = (
         "case", "quantity", "unit", "n", "h", "value", "exact", "error", "order", "passed", "problem",
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Figures of errors against resolution and run time, of surfaces, and of quantities over time.
+"""Figures of errors against resolution and run time and of surfaces.
 
 Only matplotlib's Agg and SVG backends are used, which need no display and no global state.
 """
@@ -259,17 +259,6 @@ def make_drawing(figure: Any, name: str, caption: str) -> Drawing:
 
 MAX_TRIANGLES = 20_000
 """Maximum number of triangles drawn; of a larger surface, every k-th triangle is drawn."""
-
-
-def over_time(curves: Sequence[Series], *, name: str, caption: str, y_label: str) -> Drawing:
-    """Quantities over time [s], both axes linear."""
-    figure = empty_figure(0.6 * HEIGHT)
-    axes = figure.add_subplot(xlabel="time [s]", ylabel=y_label)
-    for number, curve in enumerate(curves):
-        axes.plot(curve.x, curve.y, color=colour(number), label=curve.name, lw=1.6, marker=".", ms=4)
-    axes.grid(True, color="#dfe3e8", lw=0.8)
-    axes.legend(fontsize=8)
-    return make_drawing(figure, name, caption)
 
 
 def surface(x: Array, triangles: Ints, *, name: str, caption: str) -> Drawing:

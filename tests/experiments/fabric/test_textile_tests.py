@@ -14,10 +14,9 @@ import lyra_petsc
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments import drape
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.case import OUTCOME_FILE, load_record, save_record
 from lyra_petsc.experiments.drape import DISC, count_folds, disc_mesh, drape_coefficient, shadow
 from lyra_petsc.experiments.fabric import textile_tests
-from lyra_petsc.experiments.fabric.fabric_report import FabricCase, Record, outcome_of, pictures
+from lyra_petsc.experiments.fabric.fabric_report import Record, pictures
 from lyra_petsc.experiments.fabric.specimens import Fabric, fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import TESTS, cases_of
 from lyra_petsc.scene.materials.measured_curves import force_at
@@ -185,23 +184,6 @@ def test_folds_and_drape_coefficient_of_a_known_shadow(count: int) -> None:
     exact = (area - np.pi * DISC**2) / (np.pi * (0.15**2 - DISC**2))
     assert drape_coefficient(dark) == pytest.approx(exact, abs=0.005)
     assert count_folds(shadow(*disc_mesh(angle), 240)) == 0
-
-
-def test_a_record_is_read_from_its_file(tmp_path: Path) -> None:
-    case = FabricCase("loop-warp", "title", "loop", 0.0)
-    with Bench(MPI.COMM_SELF) as bench:
-        outcome = outcome_of(case, textile_tests.tensile(bench, FABRIC, 0.0))
-    save_record(tmp_path / OUTCOME_FILE, outcome.record)
-    found = outcome_of(case, load_record(tmp_path / OUTCOME_FILE, Record))
-    assert found.record.curves == outcome.record.curves
-    assert [(n.quantity, n.value) for n in found.record.numbers] == [
-        (n.quantity, n.value) for n in outcome.record.numbers
-    ]
-    assert found.verdicts == outcome.verdicts
-
-
-def test_all_selects_every_test() -> None:
-    assert {case.test for case in cases_of("all")} == set(TESTS)
 
 
 @pytest.mark.parametrize(

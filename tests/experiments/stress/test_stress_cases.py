@@ -11,11 +11,10 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.stress.cases import FAMILIES, limits, selected
+from lyra_petsc.experiments.stress.cases import FAMILIES, selected
 from lyra_petsc.experiments.stress.stress_scenes import (
     NotApplicable,
     Scope,
-    anisotropic,
     hanging_sheet,
     move_handles,
     scale,
@@ -117,14 +116,6 @@ def test_a_static_scene_is_refused(scene: Path) -> None:
         setting_of(scene, (), Scope.QUICK)
 
 
-def test_anisotropy_of_a_library_cloth(scene: Path) -> None:
-    setting = setting_of(scene, (), Scope.QUICK)
-    for block in anisotropic(setting.content(), 1e4)["material"]:
-        assert block["membrane"]["c11"] / block["membrane"]["c22"] == pytest.approx(1e4)
-        assert block["membrane"]["c12"] == 0.0
-    assert anisotropic(setting.content(), 1e4)["material"][1]["group"] == "sheet"
-
-
 def test_wind_has_the_speed_of_the_case_and_the_air_of_the_scene() -> None:
     content = set_wind(
         hanging_sheet(4) | {"wind": {"velocity": [1, 0, 0], "density": 0.5, "drag": 0.1}}, 50.0
@@ -163,37 +154,3 @@ def test_folds_do_not_stretch_the_sheet(name: str) -> None:
     assert after.max() < 0.9 * before.max()
     rows = np.linalg.norm(np.diff(y.reshape(41, 41, 3), axis=1), axis=2)
     assert np.median(rows) == pytest.approx(0.025, rel=1e-3)
-
-
-# -- known answers -------------------------------------------------------------------------------------
-
-
-def test_the_time_of_the_first_vertical_is_interpolated() -> None:
-    angle = np.array([0.0, 0.4, 1.2, 1.7, 2.0])
-    centres = [(math.cos(a), -math.sin(a)) for a in angle]
-    found = limits.first_vertical([0.0, 0.1, 0.2, 0.3, 0.4], centres)
-    assert found == pytest.approx(0.2 + 0.1 * (math.pi / 2 - 1.2) / 0.5)
-    assert math.isnan(limits.first_vertical([0.0, 0.1, 0.2], centres[:3]))
-
-
-def test_a_step_of_the_chain_projects_free_motion_onto_rigid_links() -> None:
-    angle = np.linspace(0.0, 0.9, 6)
-    x = np.column_stack([np.cumsum(np.cos(angle)), np.cumsum(np.sin(angle))])
-    v = np.zeros_like(x)
-    for _ in range(5):
-        free_x = x + 0.05 * v + 0.05**2 * np.array([0.0, -limits.G])
-        before, (x, v) = x, limits.step_inextensible_chain(x, v, 0.05, 1.0)
-    links = np.diff(x, axis=0)
-    np.testing.assert_allclose(np.linalg.norm(links, axis=1), 1.0, rtol=1e-13)
-    np.testing.assert_allclose(x[[0, -1]], before[[0, -1]])
-    np.testing.assert_allclose(v, (x - before) / 0.05)
-    # the change from free motion at each inner joint is along its two links
-    pull = (x - free_x)[1:-1].ravel()
-    lines = np.zeros((pull.size, len(links)))
-    for k, link in enumerate(links):
-        for joint, sign in ((k, -1.0), (k + 1, 1.0)):
-            if 0 < joint < len(x) - 1:
-                lines[2 * joint - 2 : 2 * joint, k] = sign * link
-    _, left, _, _ = np.linalg.lstsq(lines, pull, rcond=None)
-    assert np.abs(pull).max() > 1e-3
-    assert left.sum() < 1e-24

@@ -13,7 +13,6 @@ from lyra_petsc.experiments.case import OUTCOME_FILE, load_record, save_record
 from lyra_petsc.experiments.stress import stress_runner
 from lyra_petsc.experiments.stress.cases import selected
 from lyra_petsc.experiments.stress.stress_runner import (
-    MAX_FIGURES,
     BaseClock,
     SavedOutcome,
     StressOutcome,
@@ -57,17 +56,6 @@ def test_the_start_shape_is_used(comm: MPI.Comm) -> None:
     record = run_case(comm, case, SMALL).record
     assert record.observed[0].min() == pytest.approx(record.observed[0][0, 0])
     assert np.ptp(record.observed[0], axis=0) == pytest.approx([0.5, 0.5, 0.0])
-    assert (record.last is not None) is (comm.rank == 0)
-
-
-def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
-    outcomes = [
-        run_case(comm, StressCase("a", "b", base_scene, steps=1), SMALL) for _ in range(MAX_FIGURES + 2)
-    ]
-    outcomes[-1].record.stop_reason = "at once"
-    StressView(SMALL, len(outcomes)).case_ended(outcomes)
-    assert outcomes[-1].record.last is not None
-    assert sum(outcome.record.last is not None for outcome in outcomes) == MAX_FIGURES
 
 
 @pytest.mark.parallel(2)
@@ -84,8 +72,6 @@ def test_a_case_that_fails_has_a_verdict(comm: MPI.Comm, change: dict[str, Any],
     outcome = run_case(comm, StressCase("a", "b", base_scene), setting)
     assert message in outcome.failures["converged"].message
     assert not csv_row(outcome)["converged"]
-    # where it stood is kept to be drawn
-    assert (outcome.record.last is not None) is (comm.rank == 0 and "handles" not in change)
 
 
 @pytest.mark.parallel(2)
@@ -132,8 +118,6 @@ def test_an_outcome_is_read_from_its_file(comm: MPI.Comm, tmp_path: Path) -> Non
     mine, theirs = csv_row(outcome), csv_row(back)
     assert tuple(mine) == tuple(theirs) == StressView.columns
     np.testing.assert_equal(list(theirs.values()), list(mine.values()))
-    np.testing.assert_array_equal(back.record.last, outcome.record.last)
-    np.testing.assert_array_equal(back.record.triangles, outcome.record.triangles)
 
 
 def test_library_cloth_in_a_given_scene(comm: MPI.Comm, tmp_path: Path) -> None:

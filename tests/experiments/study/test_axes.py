@@ -8,7 +8,6 @@ import pytest
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.study.plan import (
-    describe_setting,
     make_combinations,
     parse_axes,
     parse_quantities,
@@ -31,13 +30,6 @@ def test_short_names_options_and_paths_of_keys() -> None:
     assert axes[0].values == (0.02, 0.01)
     assert [axis.numeric for axis in axes] == [True, False, True, True, True]
     assert not any(axis.physical for axis in axes)
-
-
-def test_keys_that_change_the_physics() -> None:
-    axes = parse_axes(["material.bending=1e-5,1e-4", "gravity=[0,0,-9.81],[0,0,-1.62]", "pc_type=lu,gamg"])
-    assert [axis.physical for axis in axes] == [True, True, False]
-    assert axes[1].values == ("[0,0,-9.81]", "[0,0,-1.62]")
-    assert axes[2].values == ("lu", "gamg")
 
 
 @pytest.mark.parametrize(
@@ -83,12 +75,6 @@ def test_names_are_unique_file_names() -> None:
     assert names[0].startswith("gravity-_0_0_-9.81_-dt0.0166666666-pc_type-lu")
 
 
-def test_settings_as_text() -> None:
-    assert describe_setting("mesh", 0.05) == "h 0.05 m"
-    assert describe_setting("ksp_rtol", 1e-4) == "ksp_rtol 1e-4"
-    assert describe_setting("pc_type", "gamg") == "pc_type gamg"
-
-
 def test_quantities() -> None:
     names = ["tip", "edge"]
     assert [q.name for q in parse_quantities("", names)] == [
@@ -111,8 +97,3 @@ def test_quantities() -> None:
 def test_unknown_quantities_are_refused(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         parse_quantities(text, ["tip"])
-
-
-def test_probes_of_a_scene_without_probes_are_refused() -> None:
-    with pytest.raises(InputError, match="the scene has no probes"):
-        parse_quantities("probes", [])

@@ -17,7 +17,6 @@ from lyra_petsc.experiments.study.comparison import (
     Errors,
     RestSurface,
     Samples,
-    barycentric,
     error_history,
     interpolation,
     overall,
@@ -158,13 +157,6 @@ def test_curved_surfaces_are_projected() -> None:
     assert np.allclose(weight.sum(axis=1), 1.0)
 
 
-def test_weights_of_the_nearest_point() -> None:
-    corners = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 4)
-    points = np.array([[0.25, 0.25, 0.3], [0.5, -1.0, 0.0], [2.0, 2.0, 0.0], [-1.0, -1.0, 0.5]])
-    expected = [[0.5, 0.25, 0.25], [0.5, 0.5, 0], [0, 0.5, 0.5], [1, 0, 0]]
-    assert np.allclose(barycentric(points, corners), expected)
-
-
 def test_different_meshes_are_recognised(tmp_path: Path) -> None:
     one, two = surface(mesh_of(SHEET)), surface(mesh_of(grid(0.3, 0.4, 3, 4, "alternating")))
     assert one.same_as(one)
@@ -184,9 +176,3 @@ def test_missing_samples_are_named(pair: tuple[Path, Path]) -> None:
         read_surface(pair[0])
     with pytest.raises(InputError, match=r"mesh\.h5: cannot be read"):
         read_samples(pair[0], TIME_KEYS, 0.1)
-
-
-def test_areas_are_thirds_of_rest_areas(pair: tuple[Path, Path]) -> None:
-    areas = read_surface(pair[0]).areas
-    assert areas.sum() == pytest.approx(0.12)
-    assert areas[0] == pytest.approx(2 * 0.005 / 3.0)

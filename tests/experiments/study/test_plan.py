@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.case import save_record
 from lyra_petsc.experiments.study.plan import Plan, Request, make_plan
 from lyra_petsc.experiments.study.study_runner import (
     choose_references,
@@ -41,11 +40,6 @@ def test_without_vary_every_integrator_and_halved_steps(tmp_path: Path) -> None:
     assert plan.axes[0].values == INTEGRATORS
     assert plan.axes[1].values == (0.02, 0.01, 0.005)
     assert any("no --vary" in note for note in plan.notes)
-
-
-def test_without_vary_no_step_is_longer_than_the_time_between_samples(tmp_path: Path) -> None:
-    plan = plan_of(tmp_path, HELD + "time: {end: 0.1, step: 0.02}\noutput: {every: 0.02}\n")
-    assert plan.axes[1].values == (0.02, 0.01, 0.005)
 
 
 def test_without_vary_tolerances_or_meshes(tmp_path: Path) -> None:
@@ -128,14 +122,6 @@ def test_the_reference_is_exact_if_an_exact_motion_applies(tmp_path: Path) -> No
     assert chosen.kind == "finer"
 
 
-def test_in_contact_and_on_request_the_reference_is_a_finer_run(tmp_path: Path) -> None:
-    plan = plan_of(tmp_path, SCENE + MOVING + "contact: {}\n", "dt=0.01")
-    (chosen,) = choose_references(plan).values()
-    assert chosen.kind == "finer"
-    plan = plan_of(tmp_path, SCENE + MOVING, "gravity=[0,0,-9],[0,0,-1]", reference="finer")
-    assert [one.kind for one in choose_references(plan).values()] == ["finer", "finer"]
-
-
 def test_every_physical_scene_has_a_reference_of_its_own(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, SCENE + MOVING, "gravity=[0,0,-9.81],[0,0,-1.62]", "dt=0.02,0.01")
     chosen = choose_references(plan)
@@ -183,27 +169,9 @@ def test_meshes_alone_are_compared_at_the_scenes_own_steps(tmp_path: Path) -> No
     ]  # fmt: skip
 
 
-def test_with_one_integrator_and_varied_meshes_the_reference_uses_it(tmp_path: Path) -> None:
-    plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125", "integrator=alpha2", "dt=0.005")
-    assert not refines_time(plan)
-    chains = make_chains(plan, [], None, "")
-    assert {"time.integrator=alpha2", "time.step=0.005"} <= set(chains[0].levels[0].overrides)
-
-
 def test_meshes_and_steps_are_refined_together(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125", "dt=0.02,0.01", "ksp_rtol=1e-2,1e-4")
     chains = make_chains(plan, [], 0.01, "alpha2")
     assert chains[0].levels[0].name == "reference-alpha2-dt0.0025-h0.0625"
     assert len({level.name for chain in chains for level in chain.levels}) == 5
     assert "petsc.ksp_rtol=1e-06" in chains[0].levels[0].overrides
-
-
-def test_requests_are_read_from_their_file(tmp_path: Path) -> None:
-    from lyra_petsc.experiments.study.plan import read_request
-
-    request = Request("a.yaml", ("time.end=1",), ("dt=0.1,0.2",), "auto", "position", 2, 4)
-    save_record(tmp_path / "request.json", request)
-    assert read_request(tmp_path) == request
-    (tmp_path / "request.json").write_text("[]", encoding="utf-8")
-    with pytest.raises(InputError, match="is damaged"):
-        read_request(tmp_path)

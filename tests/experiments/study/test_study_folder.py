@@ -28,16 +28,6 @@ def begun(path: Path) -> Path:
     return path
 
 
-def test_a_free_name_is_found(here: Path) -> None:
-    assert chosen("flag", None).path == Path("studies/flag")
-    begun(here / "studies" / "flag")
-    choice = chosen("flag", None)
-    assert choice.path == Path("studies/flag-2")
-    begun(here / "studies" / "flag-2")  # taken between the choice and the lock
-    with RunDirectory(MPI.COMM_SELF, choice) as directory:
-        assert directory.path == Path("studies/flag-3")
-
-
 def test_the_newest_is_resumed(here: Path) -> None:
     import os
 
@@ -47,25 +37,6 @@ def test_the_newest_is_resumed(here: Path) -> None:
     assert chosen("flag", None, resume=True).path == Path("studies/flag-2")
     with pytest.raises(InputError, match="no study of drape"):
         chosen("drape", None, resume=True)
-
-
-@pytest.mark.parametrize(
-    ("out", "flags", "words"),
-    [
-        ("", {}, "is empty"),
-        ("file", {}, "is a file"),
-        ("file/below", {}, "is a file"),
-        ("there", {}, "exists; name another folder"),
-        ("there", {"resume": True}, "holds no study"),
-        ("nowhere", {"resume": True}, "no study to resume"),
-        ("there", {"resume": True, "force": True}, "give one of them"),
-    ],
-)
-def test_invalid_folders_are_refused(here: Path, out: str, flags: dict[str, bool], words: str) -> None:
-    (here / "file").write_text("")
-    (here / "there").mkdir()
-    with pytest.raises(InputError, match=words):
-        chosen("x", Path(out) if out else Path(" "), **flags)
 
 
 def test_force_removes_what_a_study_writes_and_nothing_else(here: Path) -> None:
@@ -78,11 +49,3 @@ def test_force_removes_what_a_study_writes_and_nothing_else(here: Path) -> None:
     with RunDirectory(MPI.COMM_SELF, chosen("mine", folder, force=True)) as directory:
         directory.clean()
     assert sorted(path.name for path in folder.iterdir()) == ["notes.txt", "photo.png", "report.docx"]
-
-
-def test_a_locked_folder_is_refused(here: Path) -> None:
-    with RunDirectory(MPI.COMM_SELF, chosen("x", Path("out"))):
-        again = chosen("x", Path("out"), force=True)
-        with pytest.raises(InputError, match="another study is at work"):
-            RunDirectory(MPI.COMM_SELF, again)
-    RunDirectory(MPI.COMM_SELF, again).release()

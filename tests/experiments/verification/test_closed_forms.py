@@ -11,11 +11,10 @@ import pytest
 from physics import reference
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.experiments.meshes import irregular_rectangle, quarter_disc, rectangle, ring_disc
+from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, ring_disc
 from lyra_petsc.experiments.verification.cases.hanging import middle, of_chain, of_strip
 from lyra_petsc.experiments.verification.cases.membranes import answer
 from lyra_petsc.experiments.verification.cases.motions import level_fall
-from lyra_petsc.experiments.verification.flat_plates import arc
 from lyra_petsc.experiments.verification.verification_case import load_data
 
 
@@ -59,14 +58,6 @@ def test_the_midpoint_of_a_catenary_halves_its_length(row: list[float]) -> None:
     assert z == pytest.approx(float(curve(np.array([x]))[0]), abs=1e-12)
 
 
-@pytest.mark.parametrize("span", [0.3, 0.8, 1.0])
-def test_an_arc_has_its_length_and_its_span(span: float) -> None:
-    points = arc(np.linspace(0.0, 1.0, 20001), span)
-    assert np.hypot(*np.diff(points, axis=0).T).sum() == pytest.approx(1.0, abs=1e-8)
-    np.testing.assert_allclose(points[[0, -1]], [[0.0, 0.0], [span, 0.0]], rtol=0.0, atol=1e-9)
-    assert points[:, 1].max() <= 1e-12  # it sags
-
-
 def areas(vertices: Array, triangles: Ints) -> Array:
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     return np.asarray(0.5 * np.cross(b - a, c - a)[:, 2])
@@ -86,8 +77,3 @@ def test_meshes_cover_their_shape_once(
     parts = areas(*make(*arguments))
     assert parts.min() > 0.0
     assert parts.sum() == pytest.approx(area, rel=1e-14)
-
-
-def test_a_quarter_disc_fills_the_disc_with_order_two() -> None:
-    missing = [math.pi - areas(*quarter_disc(n, 2.0)).sum() for n in (16, 32)]
-    assert np.log2(missing[0] / missing[1]) == pytest.approx(2.0, abs=0.1)

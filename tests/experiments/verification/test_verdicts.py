@@ -78,11 +78,6 @@ def test_the_bound_of_a_quick_run_grows_with_h() -> None:
     assert not Claim(within=1e-3, growth=1.0).judge(rows, finest(rows) / 4.0).passed
 
 
-def test_errors_are_relative_to_their_scale() -> None:
-    assert Measured("q", 1.1, 1.0).error == pytest.approx(0.1)
-    assert Measured("q", 1e-6, 0.0, "N", 10.0).error == pytest.approx(1e-7)
-
-
 def made(**changes: object) -> VerificationCase:
     def measure(bench: Bench, n: float) -> Iterable[Measured]:
         return [Measured("a", 1.0 + n**-2, 1.0, "m"), Measured("b", 2.0, 2.0)]
