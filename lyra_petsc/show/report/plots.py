@@ -1,4 +1,4 @@
-"""Figures of errors against resolution and run time and of surfaces.
+"""Figures of errors against resolution and run time, and of surfaces.
 
 Only matplotlib's Agg and SVG backends are used, which need no display and no global state.
 """
