@@ -37,8 +37,7 @@ def test_list_names_families_and_cases(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_cases_pass_and_tables_and_a_page_with_pictures_are_written(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
+def test_cases_pass_and_tables_and_a_page_are_written(tmp_path: Path) -> None:
     pytest.importorskip("jinja2")
     left = done(["stress", "--quick", *TWO], tmp_path)
     assert "2 of 2 cases passed" in left.out
@@ -60,9 +59,7 @@ def test_cases_pass_and_tables_and_a_page_with_pictures_are_written(tmp_path: Pa
     report = (folder / "report.md").read_text()
     assert "2 of 2 cases passed" in report
     assert "stress --quick --only one-triangle,chain-1e6" in report
-    assert (folder / "report.html").read_text().count("data:image/svg+xml;base64,") == 4
-    for name in ("one-triangle-shape", "chain-1e6-shape", "chain-1e6-energy"):
-        assert (folder / "plots" / f"{name}.png").stat().st_size > 1000
+    assert "stiff limit" in (folder / "report.html").read_text()
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
