@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.petsc_options import is_set
@@ -72,7 +71,7 @@ class LocalError:
         largest = float(
             np.abs(error[vertices]).max(initial=0.0, where=equations.step.prescribed.free[vertices])
         )
-        return float(equations.points.comm.allreduce(largest, MPI.MAX))
+        return equations.points.global_max(largest)[0]
 
     def record_step(self, v_before: Array, dt: float) -> None:
         """Record the slope of the accepted step."""
@@ -156,6 +155,6 @@ class Accuracy:
         equations = self._equations
         if not equations.has_active_pairs or is_set("ts_adapt_dt_min"):
             return 0.0
-        fastest = float(equations.points.comm.allreduce(np.abs(equations.v).max(initial=0.0), MPI.MAX))
+        (fastest,) = equations.points.global_max(float(np.abs(equations.v).max(initial=0.0)))
         through = (math.inf if equations.contact is None else equations.contact.skin) / max(fastest, 1e-300)
         return min(IMPACT_SKIN_FRACTION * through, IMPACT_RUN_FRACTION * self._control.end)

@@ -36,12 +36,9 @@ class CompressionWatch:
         stretches = principal_stretches(
             self._problem.equations.x, membrane.stencil, membrane.elements.data["inverse"], n
         )
-        local = np.array([np.inf, -np.inf])
-        if n:
-            local[:] = stretches[:, 0].min(), stretches[:, 1].max()
-        ends = np.array([local[0], -local[1]])
-        comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
-        self.smallest, self.largest = float(ends[0]), float(-ends[1])
+        local = (stretches[:, 0].min(), stretches[:, 1].max()) if n else (np.inf, -np.inf)
+        opposite, self.largest = self._problem.points.global_max(-float(local[0]), float(local[1]))
+        self.smallest = -opposite
         if reported or not membrane.softens or not self.smallest < SOFTENS_BELOW:
             return None
         mine = n > 0 and local[0] == self.smallest

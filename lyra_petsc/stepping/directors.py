@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.points import Layout
@@ -42,7 +41,7 @@ class Directors:
     """
 
     def __init__(self, terms: Sequence[HasDirectors], layout: Layout) -> None:
-        self._terms, self._comm = terms, layout.comm
+        self._terms, self._layout = terms, layout
         self.frozen_in_step: Frozen | None = None
         stiffness = np.zeros((layout.n_local, 3))
         for term in terms:
@@ -69,7 +68,7 @@ class Directors:
     def largest_turn(self, displacement: Array) -> float:
         """Largest angle [rad] by which directors turn in a displacement (n_owned, 3) [m]; collective."""
         turn = max((term.largest_rotation(displacement) for term in self._terms), default=0.0)
-        return float(self._comm.allreduce(turn, MPI.MAX))
+        return self._layout.global_max(turn)[0]
 
 
 def move_frames_to_end(equations: StageEquations) -> None:
@@ -87,7 +86,7 @@ def update_frames(equations: StageEquations, x: Array) -> bool:
     for term in () if equations.step.of_edges else equations.active.with_edges:
         updated = term.updated_frames(x, equations.step.frozen[term], equations.step.prescribed.mask)
         frames |= {} if updated is None else {term: updated}
-    if not equations.points.comm.allreduce(len(frames), MPI.MAX):
+    if not any(equations.points.global_max(bool(frames))):
         return False
     equations.refreeze(frames)
     return True
@@ -116,7 +115,7 @@ def turn_with_triangles(equations: StageEquations, v: Array, increment: Array) -
         changed += _set(
             equations, increment, *term.edge_increments(x, displacement, equations.step.frozen[term])
         )
-    return bool(equations.points.comm.allreduce(changed, MPI.MAX))
+    return any(equations.points.global_max(changed))
 
 
 def match(equations: StageEquations, v: Array, increment: Array, curved: Array) -> None:

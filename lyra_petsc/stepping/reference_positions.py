@@ -41,10 +41,7 @@ class ReferencePositions:
 
     def restore(self, start: float, x: Array) -> None:
         """Restore from a checkpoint the positions x (n_owned, 3) at ``start`` [s]; collective."""
-        shape = np.zeros((self._layout.n_local, 3))
-        shape[: len(x)] = x
-        self._layout.update_ghosts(shape)
-        self._begin(start, shape)
+        self._begin(start, self._layout.extended(x))
 
     def _begin(self, start: float, x: Array) -> None:
         if start > 0.0:

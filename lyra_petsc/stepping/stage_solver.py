@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
@@ -277,7 +276,7 @@ class StageSolver:
             return None, message
         reached = self.snes.getSolution()
         velocity = reached.getArray(readonly=True).reshape(self._shape)
-        if equations.points.comm.allreduce(int(not np.isfinite(velocity).all())):
+        if any(equations.points.global_max(not np.isfinite(velocity).all())):
             return None, "the velocities are not finite"
         whole = self._iterates or step.of_edges
         return self._points.at(reached) if whole else equations.evaluate(velocity), ""
@@ -301,7 +300,7 @@ class StageSolver:
         """
         blamed = of_user(quoted(error), self.filled)
         may_help = len(self._candidates) > 1 and reasons.in_set_up(error) and not blamed
-        return bool(self._equations.points.comm.allreduce(int(may_help), op=MPI.MIN))
+        return not any(self._equations.points.global_max(not may_help))
 
     def _judge(self) -> str:
         """Why the solve that PETSc ended is not good, or nothing; collective."""

@@ -84,16 +84,8 @@ class State:
 
     def set(self, x: Array, v: Array) -> None:
         """Set positions and velocities (n_owned, 3), in new arrays; collective."""
-        layout, self.evaluation = self._discretisation.layout, None
-        self.x, self.v = (resized(values, layout.n_owned, layout.n_local) for values in (x, v))
-        self.update_ghosts()
-
-
-def resized(values: Array, n_owned: int, n_local: int) -> Array:
-    """Copy of an array's owned rows, followed by zeros up to n_local rows."""
-    out = np.zeros((n_local, 3))
-    out[:n_owned] = values[:n_owned]
-    return out
+        extended, self.evaluation = self._discretisation.layout.extended, None
+        self.x, self.v = extended(x), extended(v)
 
 
 def kinetic_energy(mass: Array, velocity: Array) -> float:

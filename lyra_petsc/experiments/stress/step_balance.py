@@ -34,12 +34,11 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import StepAccount
 from lyra_petsc.stepping.newton.force_scales import ROUNDOFF, residual_roundoff
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
-from lyra_petsc.stepping.state import resized
 from lyra_petsc.terms.bending.hinge import Bending
 from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.protocols import MovingTargets
-from lyra_petsc.terms.term import Elastic, UpcomingStep
+from lyra_petsc.terms.term import Elastic
 
 if TYPE_CHECKING:
     from lyra_petsc.contact.barrier import ContactBarrier
@@ -233,10 +232,7 @@ class BalanceRecorder:
         equations, simulation = self._equations, self._simulation
         layout, account = equations.points, simulation.energy_balance.account
         comm, n, dt = layout.comm, layout.n_owned, report.dt
-        for name in ("_x", "_v"):  # extended to the present ghosts of contact
-            values = resized(getattr(self, name), n, layout.n_local)
-            layout.update_ghosts(values)
-            setattr(self, name, values)
+        self._x, self._v = (layout.extended(values[:n]) for values in (self._x, self._v))
         x0, x1 = self._x, equations.x
         dx, sheet = x1 - x0, self._frozen(self._sheet_terms)
         frames = {term: old for term, old in self._frames.items() if sheet[term].number != old.number}
@@ -304,13 +300,7 @@ class BalanceRecorder:
         if self._simulation.last_integrator.centred:
             vertices = equations.points.are_vertices(equations.points.global_number)
             y = y + np.where(vertices[:, None], stage.offset * self._v, 0.0)
-        step = UpcomingStep(
-            equations.step.start,
-            equations.step.end,
-            equations.step.start + stage.offset,
-            y,
-            equations.reference.at,
-        )
+        step = equations.targets_at(equations.step.at_stage, y)
         frozen = dict(self._frozen(equations.active.elastic))
         if stage.offset < dt:  # moving targets are at the end of the step by now
             moved = (

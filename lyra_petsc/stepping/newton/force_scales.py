@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
@@ -36,7 +35,7 @@ def expected_iterations(forces: StageForces, dt: float) -> float:
     """
     n = forces.layout.n_vertices
     ratio = dt * dt * vertex_scales(forces, 1.0)[:n] / forces.mass[:n]
-    return 0.5 * float(np.sqrt(forces.layout.comm.allreduce(float(ratio.max(initial=0.0)), MPI.MAX)))
+    return 0.5 * float(np.sqrt(forces.layout.global_max(float(ratio.max(initial=0.0)))[0]))
 
 
 def residual_roundoff(forces: StageForces, size: float) -> float:
@@ -62,4 +61,4 @@ def limit_roundoff(at: Evaluation) -> float:
 
 def _norm(layout: Layout, scale: Array) -> float:
     """Norm [N] of the round-off for scales (n_owned,) [N] of the forces on owned rows; collective."""
-    return ROUNDOFF * float(np.sqrt(layout.comm.allreduce(float(np.sum(scale**2)))))
+    return ROUNDOFF * float(np.sqrt(layout.global_sum(float(np.sum(scale**2)))[0]))

@@ -136,7 +136,7 @@ class Trace:
             step, held = equations.step, equations.step.prescribed
             there = equations.prescriptions.positions(step.start, step.end, step.at_stage, equations.x)
             held.overwrite(position, there.take(held.indices))
-        square = equations.points.comm.allreduce(float(np.vdot(residual, residual)))
+        (square,) = equations.points.global_sum(float(np.vdot(residual, residual)))
         return FailedSolve(
             tuple(self._iterations),
             float(np.sqrt(square)),

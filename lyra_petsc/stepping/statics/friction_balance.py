@@ -21,7 +21,6 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.directors import transport_frames
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.stepping.state import resized
 
 LAG, ROUGH_LAG, MAX_ROUNDS = 1e-6, 1e-3, 20
 """Fraction by which friction may differ from what the normal forces of the equilibrium allow; that before
@@ -120,9 +119,7 @@ class FrictionBalance:
         """Accept the part of the load step that ends at the present positions; collective."""
         equations, start = self._equations, self._start
         if start is not None:  # the search for pairs may have added ghosts since
-            x = resized(start[0], equations.points.n_owned, equations.points.n_local)
-            equations.points.update_ghosts(x)
-            start = x, start[1]
+            start = equations.points.extended(start[0]), start[1]
         self._landed = equations.active.accept_substep(equations.x, equations.step.frozen, start)
 
     def keeps_first_state(self, *, failed: bool) -> bool:
