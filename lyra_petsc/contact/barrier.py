@@ -18,13 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.contact import contact_pairs, surface_shares
-from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
-from lyra_petsc.contact.contact_search import EDGE_GAP, ContactSearch
-from lyra_petsc.contact.contact_setup import AREA_UNITS, HALFWAY_CURVATURE, Barrier, surface_elements
+from lyra_petsc.contact import contact_pairs, one_sided, pair_distances, pair_motion
+from lyra_petsc.contact.barrier_law import barrier as barrier_law
+from lyra_petsc.contact.barrier_pairs import barrier_pairs
+from lyra_petsc.contact.contact_search import ContactSearch
+from lyra_petsc.contact.contact_setup import HALFWAY_CURVATURE, Barrier, surface_elements
 from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles, StepInterval
 from lyra_petsc.contact.one_sided import Springs
-from lyra_petsc.contact.pairs import NearPairs, no_near_pairs
+from lyra_petsc.contact.pair_distances import EDGE_EDGE
+from lyra_petsc.contact.pairs import Contacts, NearPairs, chosen, no_near_pairs
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.scene.schema import Scene
@@ -101,37 +103,6 @@ class Pair(NamedTuple):
     thickness: float
 
 
-class Contacts(NamedTuple):
-    """Pairs in contact at the end of a step that this rank counts.
-
-    Attributes
-    ----------
-    points, sheet_beta, beta : (m, 4)
-        Local rows of the vertices, their coefficients β, 0 for points of obstacles, and those of all points:
-        the vector between the nearest points is Σ β_i p_i.
-    normal : (m, 3)
-        Unit normals towards the first simplex.
-    force, stiffness : (m,)
-        Normal force [N] and second derivative b″ of the energy with respect to the distance [N/m], > 0.
-    obstacle : (m,)
-        Number of the obstacle, −1 between sheets.
-    velocity : (m, 3)
-        Velocity [m/s] of the obstacle at the contact, times Σ β_i; 0 between sheets.
-    pair : (m,)
-        Numbers of the term's elements.
-    """
-
-    points: Ints
-    sheet_beta: Array
-    beta: Array
-    normal: Array
-    force: Array
-    stiffness: Array
-    obstacle: Ints
-    velocity: Array
-    pair: Ints
-
-
 _EMPTY = np.empty(0)
 _EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 6))
 NO_PAIRS = ActivePairs(*unwritable(_EMPTY, *_EMPTY_ROWS))
@@ -172,39 +143,11 @@ class ContactBarrier(LimitsStep):
         the first ``n_counted``.
         """
         self.set_elements(Elements(stencil, n_owned=n_counted))
-        self.number, self.kind, self.obstacle = pairs.vertices, pairs.kind, pairs.obstacle
-        self.points = np.where(pairs.obstacle_points < 0, pairs.obstacle_points, self.stencil)
-        narrowing = pairs.narrowing / AREA_UNITS
-        self.offset = self.barrier.thickness / narrowing + self.obstacles.radius[self.obstacle]
-        self.shares = surface_shares.shares(pairs.surroundings)
-        self.pair_stiffness = self.barrier.stiffness / AREA_UNITS * pairs.stiffness
-        self.gap = np.where(self._are_secondary(), EDGE_GAP, 1.0) * self.barrier.gap
-        # distance from the image in a wall over that from the wall: k (g − 2 d)³ / 2 d = 4 k (g / 2 − d)³ / d
-        image_scale = np.where(self.obstacle >= self.obstacles.first_wall, 2.0, 1.0)
-        self._scale = image_scale * narrowing
-        self.gap /= self._scale
-        self.pair_stiffness *= image_scale**2 * narrowing
+        of_search = self.obstacles, self.search.obstacle_x
+        self.pairs = barrier_pairs(pairs, self.stencil, self.barrier, *of_search)
         self._active_at = PositionCache(self._find_active)
         self._expected = np.full(self.n_elements, np.nan)
-        largest = np.append(np.abs(self.search.obstacle_x).max(axis=(0, 2)), 0.0)
-        of_points = largest[np.where(self.points < 0, ~self.points, -1)]
-        self._largest_coordinate = np.maximum(np.abs(self.offset), of_points.max(axis=1))
         self._springs: Springs | None = None
-
-    def _are_secondary(self) -> NDArray[np.bool_]:
-        """Which pairs (E,) have the gap `EDGE_GAP`: two edges of sheets, and edges and points of obstacles
-        where their triangles are smooth.
-        """
-        obstacles, points = self.obstacles, self.points
-        out: NDArray[np.bool_] = (self.kind == EDGE_EDGE) & (self.obstacle < 0)
-        corners = np.flatnonzero((self.kind == VERTEX_TRIANGLE) & (points[:, 0] < 0))
-        out[corners] = obstacles.smooth_points[~points[corners, 0]]
-        edges = np.flatnonzero((self.kind == EDGE_EDGE) & (self.obstacle >= 0))
-        ends = np.sort(~points[edges, 2:], axis=1)
-        keys = ends[:, 0] * obstacles.n_points + ends[:, 1]
-        first, last = (np.searchsorted(obstacles.smooth_edges, keys, side=s) for s in ("left", "right"))
-        out[edges] = first < last
-        return out
 
     # -- obstacles ---------------------------------------------------------------------------------
 
@@ -226,25 +169,20 @@ class ContactBarrier(LimitsStep):
     def _find_active(self, points: Array) -> tuple[NDArray[Any], ...]:
         x, obstacle_x = np.split(points, [len(points) - self.obstacles.n_points])
         lower_bound = np.empty(self.n_elements)
-        data = *self._pair_data, self.shares, self.n_owned
+        data = *self._pair_data, self.pairs.shares, self.n_owned
         while True:
             capacity = self._capacity
             integers = np.empty(capacity, dtype=np.int64), *np.empty((2, capacity))
-            found = *integers, np.empty((capacity, 4)), np.empty(capacity), np.empty((capacity, 6))
-            active = contact_pairs.find_active(x, obstacle_x, *data, lower_bound, found)
+            arrays = *integers, np.empty((capacity, 4)), np.empty(capacity), np.empty((capacity, 6))
+            active = contact_pairs.find_active(x, obstacle_x, *data, lower_bound, arrays)
             if active <= capacity:
-                return lower_bound, *(part[:active] for part in found)
+                return lower_bound, *(values[:active] for values in arrays)
             self._capacity = active + active // 4
 
     @property
-    def _geometry(self) -> tuple[Ints, Ints, Array, Array]:
-        """Kinds, points, offsets and gaps of the pairs: arguments of kernels."""
-        return self.kind, self.points, self.offset, self.gap
-
-    @property
     def _pair_data(self) -> tuple[Any, ...]:
-        """Also their stiffness, and `Barrier.parallel`."""
-        return *self._geometry, self.pair_stiffness, self.barrier.parallel
+        """The pairs, their stiffness and `Barrier.parallel`: arguments of kernels."""
+        return *self.pairs.geometry, self.pairs.stiffness, self.barrier.parallel
 
     def energies(self, x: Array, frozen: ObstaclePositions) -> Array:
         if not self.n_elements:
@@ -284,16 +222,16 @@ class ContactBarrier(LimitsStep):
         return float((active.owned_weight * active.stiffness).max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:
-        return HALFWAY_CURVATURE * self.pair_stiffness * size
+        return HALFWAY_CURVATURE * self.pairs.stiffness * size
 
     def stiffness(self, x: Array, frozen: ObstaclePositions) -> Array:
         active, out = self.active_pairs(x, frozen.stage), np.zeros(self.n_elements)
         stiffness = np.maximum(active.weight, active.owned_weight) * active.stiffness
-        out[active.pair] = np.maximum(stiffness, HALFWAY_CURVATURE * self.pair_stiffness[active.pair])
+        out[active.pair] = np.maximum(stiffness, HALFWAY_CURVATURE * self.pairs.stiffness[active.pair])
         return out
 
     def coordinate_scale(self, size: float) -> Array:
-        return np.maximum(size, self._largest_coordinate)
+        return np.maximum(size, self.pairs.coordinate)
 
     # -- limits and corrections of Newton's increments ---------------------------------------------
 
@@ -301,11 +239,11 @@ class ContactBarrier(LimitsStep):
         if not self.n_elements:
             return 1.0
         at_rest = np.zeros_like(frozen.stage)
-        approach = contact_pairs.largest_approach(dx, at_rest)
+        approach = pair_motion.largest_approach(dx, at_rest)
         bound = self.active_pairs(x, frozen.stage).lower_bound
         near = np.flatnonzero(approach > (1.0 - KEPT_FRACTION) * bound)
-        pairs = *(data[near] for data in self._geometry), KEPT_FRACTION, 1.0
-        return float(contact_pairs.largest_step(x, frozen.stage, dx, at_rest, *pairs))
+        pairs = *(data[near] for data in self.pairs.geometry), KEPT_FRACTION, 1.0
+        return float(pair_motion.largest_step(x, frozen.stage, dx, at_rest, *pairs))
 
     def springs(self, x: Array, approach: float, frozen: ObstaclePositions) -> Springs:
         """One-sided springs for the pairs in contact at x (n_local, 3), or that may be after points have
@@ -313,17 +251,17 @@ class ContactBarrier(LimitsStep):
         `release_springs`.
         """
         active, capacity = self.active_pairs(x, frozen.stage), self._capacity
-        given = active.pair, active.weight, active.owned_weight, active.beta, active.derivatives
+        of_active = active.pair, active.weight, active.owned_weight, active.beta, active.derivatives
         while True:
             integers = np.empty(capacity, dtype=np.int64)
-            found = integers, np.empty((capacity, 4)), np.empty((capacity, 3)), *np.empty((3, capacity))
-            pairs = *self._pair_data, given, self.n_owned
-            n_active, n = contact_pairs.find_springs(x, frozen.stage, approach, *pairs, found)
+            arrays = integers, np.empty((capacity, 4)), np.empty((capacity, 3)), *np.empty((3, capacity))
+            pairs = *self._pair_data, of_active, self.n_owned
+            n_active, n = one_sided.find_springs(x, frozen.stage, approach, *pairs, arrays)
             if n <= capacity:
                 break
             capacity = n
-        pair, beta, normal, scale, length, counted = (part[:n] for part in found)
-        springs = self.points[pair], beta, normal, scale, self.gap[pair], length, counted
+        pair, beta, normal, scale, length, counted = (values[:n] for values in arrays)
+        springs = self.pairs.points[pair], beta, normal, scale, self.pairs.gap[pair], length, counted
         self._springs = Springs(pair, *springs, np.arange(n) < n_active)
         return self._springs
 
@@ -338,9 +276,9 @@ class ContactBarrier(LimitsStep):
 
     def target_distances(self, x: Array, dx: Array, frozen: ObstaclePositions) -> tuple[NDArray[Any], ...]:
         """Distances of pairs that `add_corrections` restores after Newton's increment dx (n_local, 3) [m]."""
-        n, pairs = self.n_elements, (*self._geometry, TARGET_FRACTION, self._expected)
+        n, pairs = self.n_elements, (*self.pairs.geometry, TARGET_FRACTION, self._expected)
         targets = np.empty(n), np.zeros((n, 3)), np.empty(n, np.bool_)
-        contact_pairs.target_distances(x, frozen.stage, dx, *pairs, *targets)
+        pair_motion.target_distances(x, frozen.stage, dx, *pairs, *targets)
         return targets
 
     def add_corrections(
@@ -357,8 +295,8 @@ class ContactBarrier(LimitsStep):
         Adds corrections of the increment to ``out`` (n_local, 3) [m], each times a weight, and the weights to
         ``weight`` (n_local, 1).
         """
-        pairs = *self._geometry, *targets, TARGET_TOLERANCE
-        return bool(contact_pairs.add_corrections(x, frozen.stage, dx, *pairs, out, weight))
+        pairs = *self.pairs.geometry, *targets, TARGET_TOLERANCE
+        return bool(pair_motion.add_corrections(x, frozen.stage, dx, *pairs, out, weight))
 
     # -- collisions --------------------------------------------------------------------------------
 
@@ -371,27 +309,27 @@ class ContactBarrier(LimitsStep):
         if not self.n_elements:
             return True
         curved = np.flatnonzero(self.search.path_deviations > MAX_DEVIATION * self.barrier.gap)
-        if len(curved) and np.isin(self.obstacle, curved).any():
+        if len(curved) and np.isin(self.pairs.obstacle, curved).any():
             return False
         motion = frozen.displacements(interval, dx)
-        return bool(contact_pairs.largest_step(x, *motion, *self._geometry, KEPT_FRACTION, 1.0) == 1.0)
+        return bool(pair_motion.largest_step(x, *motion, *self.pairs.geometry, KEPT_FRACTION, 1.0) == 1.0)
 
     def distances(self, x: Array, obstacle_x: Array) -> Array:
         """Distance less offset [m] of all pairs, (E,), with points of obstacles at obstacle_x (m, 3)."""
         out = np.empty(self.n_elements)
-        contact_pairs.distances(x, obstacle_x, self.kind, self.points, out)
-        return out - self.offset
+        pair_distances.distances(x, obstacle_x, self.pairs.kind, self.pairs.points, out)
+        return out - self.pairs.offset
 
     def gaps(self, x: Array, frozen: ObstaclePositions) -> Array:
         """Distance less thickness [m] between the two simplices of each owned pair, (n_owned,)."""
-        return (self._scale * self.distances(x, frozen.stage))[: self.n_owned]
+        return (self.pairs.scale * self.distances(x, frozen.stage))[: self.n_owned]
 
     def largest_steps(self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval) -> Array:
         """Fraction, up to 1, of the displacement dx (n_local, 3) [m] from x on which each pair alone does not
         collide, (E,), while obstacles move as in an interval of the step.
         """
         motion, out = frozen.displacements(interval, dx), np.empty(self.n_elements)
-        contact_pairs.largest_steps(x, *motion, *self._geometry, KEPT_FRACTION, out)
+        pair_motion.largest_steps(x, *motion, *self.pairs.geometry, KEPT_FRACTION, out)
         return out
 
     def may_collide(self, x: Array, dx: Array, frozen: ObstaclePositions, threshold: float) -> bool:
@@ -399,13 +337,16 @@ class ContactBarrier(LimitsStep):
         from x; only pairs that approach by more than ``threshold`` [m] count.
         """
         motion = frozen.displacements(TO_STAGE, dx)
-        return bool(contact_pairs.may_collide(x, *motion, *self._geometry, threshold))
+        return bool(pair_motion.may_collide(x, *motion, *self.pairs.geometry, threshold))
 
     def pair(self, element: int) -> Pair:
         """The pair of simplices of this number."""
-        points, n_first = self.points[element].tolist(), 2 if self.kind[element] == EDGE_EDGE else 1
+        points, n_first = (
+            self.pairs.points[element].tolist(),
+            2 if self.pairs.kind[element] == EDGE_EDGE else 1,
+        )
         parts = (tuple(points[:n_first]), tuple(points[n_first:]))
-        number = int(self.obstacle[element])
+        number = int(self.pairs.obstacle[element])
         name = self.obstacles.each[number].name if number >= 0 else ""
         return Pair(tuple(part for part in parts if min(part) >= 0), name, self.barrier.thickness)
 
@@ -416,13 +357,13 @@ class ContactBarrier(LimitsStep):
         it.
         """
         active = self.active_pairs(x, obstacle_x)
-        number = self.obstacle[active.pair]
+        number = self.pairs.obstacle[active.pair]
         for obstacle in np.unique(number[number >= 0]):
             rows = np.flatnonzero((number == obstacle) & (active.owned_weight != 0.0))
             gradient, on_obstacles = np.zeros_like(x), np.zeros_like(obstacle_x)
             arrays = active.pair, active.owned_weight, active.beta, active.derivatives
-            given = unwritable(*(array[rows] for array in arrays))
-            contact_pairs.add_gradient(x, obstacle_x, *self._pair_data, given, gradient, on_obstacles)
+            chosen_arrays = unwritable(*(array[rows] for array in arrays))
+            contact_pairs.add_gradient(x, obstacle_x, *self._pair_data, chosen_arrays, gradient, on_obstacles)
             yield int(obstacle), gradient
 
     def obstacle_forces(self, x: Array, frozen: ObstaclePositions) -> Array:
@@ -432,9 +373,9 @@ class ContactBarrier(LimitsStep):
         out = np.zeros((len(self.obstacles.each), 8))
         for obstacle, force in self._obstacle_gradients(x, frozen.stage):
             out[obstacle, :6] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
-        _, _, normal_force, _, pair = self.find_contacts(x, frozen.stage, self.n_owned)
-        on = self.obstacle[pair] >= 0
-        np.add.at(out[:, 6], self.obstacle[pair][on], normal_force[on])
+        contacts = self.find_contacts(x, frozen.stage)
+        on = contacts.obstacle >= 0
+        np.add.at(out[:, 6], contacts.obstacle[on], contacts.force[on])
         return out
 
     def work(self, x: Array, at: float, start: float, end: float) -> float:
@@ -457,10 +398,12 @@ class ContactBarrier(LimitsStep):
         blocked = self.largest_steps(x, dx, frozen, TO_STAGE) < 1.0
         moved = dx.copy()
         for number, (rotation, translation) in enumerate(frozen.stage_motions):
-            points = self.points[blocked & (self.obstacle == number)]
+            points = self.pairs.points[blocked & (self.pairs.obstacle == number)]
             points = np.unique(points[points >= 0])
             moved[points] = (x @ rotation.T + translation - x)[points]
-        for points in self.points[blocked & (self.obstacle < 0)]:  # a moved sheet moves the next one
+        for points in self.pairs.points[
+            blocked & (self.pairs.obstacle < 0)
+        ]:  # a moved sheet moves the next one
             changed = (moved[points] != dx[points]).any(axis=1)
             if changed.any():
                 moved[points[~changed]] = moved[points[changed]][0]
@@ -468,57 +411,50 @@ class ContactBarrier(LimitsStep):
 
     # -- contact forces ----------------------------------------------------------------------------
 
-    def find_contacts(self, x: Array, obstacle_x: Array, n_counted: int) -> tuple[NDArray[Any], ...]:
-        """The pairs with a contact force among the first ``n_counted``.
-
-        Returns β (m, 4), unit normals (m, 3), normal forces (m,) [N], distances less offset (m,) [m] and
-        numbers of the pairs (m,). For a vertex of a sheet, pairs with the same nearest vertices occur once;
-        all other pairs are returned singly.
-        """
-        active = self.active_pairs(x, obstacle_x)
-        n = len(active.pair) + n_counted
-        found = np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
-        given = active.lower_bound, active.forces, n_counted
-        n = contact_pairs.find_contacts(x, obstacle_x, *self._pair_data, *given, found)
-        beta, normal, force, delta, pair = (part[:n] for part in found)
+    def find_contacts(self, x: Array, obstacle_x: Array) -> Contacts:
+        """The contacts of this rank's pairs for positions x (n_local, 3) [m] and obstacle_x (m, 3) [m]."""
+        active, near = self.active_pairs(x, obstacle_x), self.pairs
+        capacity = len(active.pair) + self.n_owned
+        pair, force, distance = np.empty(capacity, dtype=np.int64), *np.empty((2, capacity))
+        beta, normal = np.empty((capacity, 4)), np.empty((capacity, 3))
+        data = *self._pair_data, active.lower_bound, active.forces, self.n_owned
+        out = beta, normal, force, distance, pair
+        n = contact_pairs.find_contacts(x, obstacle_x, *data, out)
+        pair, beta, normal, force = pair[:n], beta[:n], normal[:n], force[:n]
         if (force < 0.0).any():
-            contact_pairs.cancel_negative(self.kind[pair], self.points[pair, 0], normal, force)
-        kept = force > 0.0
-        return beta[kept], normal[kept], force[kept], delta[kept], pair[kept]
+            contact_pairs.cancel_negative(near.kind[pair], near.points[pair, 0], normal, force)
+        rows, sheet_beta = self.stencil[pair].astype(np.int64), np.where(near.points[pair] >= 0, beta, 0.0)
+        obstacle = near.obstacle[pair]
+        contacts = Contacts(pair, rows, sheet_beta, beta, normal, force, distance[:n], obstacle)
+        return chosen(contacts, force > 0.0)
 
-    def contacts(self, x: Array, v: Array, frozen: ObstaclePositions, last: tuple[float, float]) -> Contacts:
-        """The pairs in contact at the end of the step, with positions x and velocities v (n_local, 3). The
-        velocities of obstacles are means between the two times ``last`` [s].
-        """
-        beta, normal, force, delta, pair = self.find_contacts(x, frozen.end, self.n_owned)
-        points, obstacle = self.stencil[pair].astype(np.int64), self.obstacle[pair]
-        _, slope, curvature = contact_pairs.barrier(delta, self.gap[pair])
-        of_sheet = np.where(self.points[pair] >= 0, beta, 0.0)
-        velocity = self.obstacles.contact_velocities(x, v, points, of_sheet, obstacle, last)
-        stiffness = -force * curvature / slope
-        return Contacts(points, of_sheet, beta, normal, force, stiffness, obstacle, velocity, pair)
+    def contact_stiffness(self, contacts: Contacts) -> Array:
+        """Second derivative b″ [N/m] of the energy with respect to the distance of each contact, > 0."""
+        _, slope, curvature = barrier_law(contacts.distance, self.pairs.gap[contacts.pair])
+        stiffness: Array = -contacts.force * curvature / slope
+        return stiffness
 
     def normal_forces(self, x: Array, frozen: ObstaclePositions) -> Array:
         """Sum of the normal forces [N] at each local vertex, (n_local,), of the pairs that this rank counts.
 
         Only the owner of a vertex knows all pairs between which its force is divided.
         """
-        out = np.zeros(len(x))
-        beta, _, force, _, pair = self.find_contacts(x, frozen.stage, self.n_owned)
-        contact_pairs.add_normal_forces(self.points[pair], beta, force, out)
-        return out
+        contacts = self.find_contacts(x, frozen.stage)
+        shares = contacts.force[:, None] * np.abs(contacts.sheet_beta)
+        return np.bincount(contacts.rows.ravel(), shares.ravel(), len(x)).astype(np.float64)
 
     def history(self, x: Array, frozen: ObstaclePositions) -> Mapping[str, float]:
         active, n = self.active_pairs(x, frozen.stage), self.n_owned
-        scale = self._scale[:n]
+        scale = self.pairs.scale[:n]
         bound = scale * active.lower_bound[:n]
-        exact = bound < scale * self.gap[:n]
+        exact = bound < scale * self.pairs.gap[:n]
         smallest = bound[exact].min(initial=np.inf)
         rows = np.flatnonzero(~exact & (bound < smallest))
         if len(rows):
             distance = np.empty(len(rows))
-            contact_pairs.distances(x, frozen.stage, self.kind[rows], self.points[rows], distance)
-            smallest = min(smallest, (scale[rows] * (distance - self.offset[rows])).min())
+            near = self.pairs.kind[rows], self.pairs.points[rows]
+            pair_distances.distances(x, frozen.stage, *near, distance)
+            smallest = min(smallest, (scale[rows] * (distance - self.pairs.offset[rows])).min())
         work = {"friction_work": 0.0}  # replaced by the friction term's if there is one
         return work | {"contacts": float(active.owned_weight.sum()), "smallest_gap": float(smallest)}
 

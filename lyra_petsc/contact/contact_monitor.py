@@ -46,7 +46,7 @@ class ContactMonitor:
         sums = [here["contacts"]]
         if friction is not None:
             sums += friction.count_sticking(x, frozen[friction])
-            sums.append(float(barrier.find_contacts(x, obstacles.stage, barrier.n_owned)[2].sum()))
+            sums.append(float(barrier.find_contacts(x, obstacles.stage).force.sum()))
         sums = layout.global_sum(*sums).tolist()
         extremes = np.array([stiffest, -here["smallest_gap"]])
         layout.comm.Allreduce(MPI.IN_PLACE, extremes, MPI.MAX)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.contact.contact_pairs import EDGE_EDGE
 from lyra_petsc.contact.contact_setup import AREA_UNITS, Barrier
 from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles
 from lyra_petsc.contact.obstacle_search import ObstacleSearch
+from lyra_petsc.contact.pair_distances import EDGE_EDGE
 from lyra_petsc.contact.pairs import NearPairs, no_near_pairs
 from lyra_petsc.contact.sheet_search import SheetSearch
 from lyra_petsc.mesh.obstacles import Container, Solid

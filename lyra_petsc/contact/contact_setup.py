@@ -18,7 +18,7 @@ from lyra_petsc.mesh.topology import connected_pieces, edge_table
 from lyra_petsc.scene.values import AXES
 from lyra_petsc.terms.rest import RestShape
 
-PARALLEL = 1e-3
+NEARLY_PARALLEL = 1e-3
 """Squared sine of the angle of two edges below which their energy is multiplied by the mollifier."""
 
 HALFWAY_CURVATURE = 14.0
@@ -141,7 +141,7 @@ def barrier(rest: RestShape) -> Barrier:
     stiffness *= max(1.0 / HALFWAY_CURVATURE, MIN_STRAIN * float(length.mean()) / gap)
     flat = float(length.max()) ** 2 / (8.0 * SAG * gap)
     walls = tuple(wall.container for wall in symmetry_walls(scene, rest.mesh))
-    return Barrier(gap, thickness, stiffness, PARALLEL, flat, walls)
+    return Barrier(gap, thickness, stiffness, NEARLY_PARALLEL, flat, walls)
 
 
 def _gap_and_narrowing(rest: RestShape) -> tuple[float, Array]:

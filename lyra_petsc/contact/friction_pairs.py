@@ -32,16 +32,12 @@ import math
 
 import numpy as np
 
-from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.contact.pair_distances import EDGE_EDGE, PARALLEL, VERTEX_TRIANGLE
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vector3 import combined, cross, dot, minus, point
 from lyra_petsc.kernels.vectors import add_outers
-
-SLIP, SLID, BETA, NORMAL, START, CONTACT, FORCE, FACTOR, STIFFNESS = 6, 9, 10, 14, 17, 20, 23, 24, 25
-ROTATION, COLUMNS = 26, 35
-"""First columns of the entries in a row of `friction.Pairs.data`, and the number of columns."""
 
 LEVER = 0.25
 """Smallest lever (in the least favourable direction) of the vertices around nearest points over their
@@ -51,19 +47,13 @@ no lever."""
 PARALLEL_COSINE = 0.7
 """Cosine of the angle of two normals above which they count as equal."""
 
-MIN_LEVER_PRODUCT = 1e-12
-"""Product of the squared levers over the square of their sum below which the lever counts as 0."""
-
-EDGE_TOLERANCE = 1e-7
-"""Barycentric coordinate below which a point counts as being on an edge: where meshes lie on each other in
-line, rounding decides in which triangle the nearest point is."""
+TIE = 1e-6
+"""Barycentric coordinate below which a point counts as being on an edge, and relative difference up to which
+squared lengths count as equal: where meshes lie on each other in line, rounding would decide."""
 
 TIE_BREAK = (0.54, 0.62, 0.57)
 """Direction in which triangles are compared, because numbers of vertices depend on the number of ranks;
 meshes are hardly ever symmetric to it."""
-
-LENGTH_TOLERANCE = 1e-6
-"""Relative difference of squared lengths that may be due to rounding."""
 
 
 @leaf()
@@ -99,7 +89,7 @@ def rotation_vectors(p, kind, n, rotation):  # type: ignore[no-untyped-def]
     u, v, w = cross(two, three), cross(three, one), cross(one, two)
     det = dot(one, u)
     product = det / total if total > 0.0 else 0.0
-    if not product > MIN_LEVER_PRODUCT * total * total:
+    if not product > PARALLEL * total * total:
         rotation[:] = 0.0
         return 0.0
     for i in range(start, 4):
@@ -257,14 +247,14 @@ def choose_triangles(x, stencil, points, number, kind, obstacle, beta, normal, a
 
 @leaf()
 def _snap_to_edges(x, stencil, e, beta, normal, m):  # type: ignore[no-untyped-def]
-    """Move a nearest point that is within `EDGE_TOLERANCE` of an edge or vertex of its triangle there, with β
+    """Move a nearest point that is within `TIE` of an edge or vertex of its triangle there, with β
     and the normal in row m; returns the number of vertices with non-zero β.
     """
     largest, nearest, removed = 1, 3, 0.0
     for i in range(2, 4):
         largest = i if abs(beta[m, i]) > abs(beta[m, largest]) else largest
     for i in range(1, 4):
-        if abs(beta[m, i]) < EDGE_TOLERANCE:
+        if abs(beta[m, i]) < TIE:
             removed, nearest, beta[m, i] = removed + beta[m, i], nearest - 1, 0.0
     if removed != 0.0:
         beta[m, largest] += removed
@@ -316,79 +306,45 @@ def write_keys(points, number, kind, obstacle, beta, at, out):  # type: ignore[n
 
 
 @kernel()
-def fill_columns(x, stencil, points, keys, contacts, previous, old, data):  # type: ignore[no-untyped-def]
-    """Write the data of pairs with keys (E, 10) at positions x to data (E, 35).
+def measure(x, stencil, points, keys, pair, beta, normal, out):  # type: ignore[no-untyped-def]
+    """Write the geometry of pairs with keys (E, 10) at positions x to ``out``: `FrictionPairs.tangents`,
+    ``gradients``, ``start``, ``contact_point`` and ``factor``; β (E, 4) of obstacles' points become 0.
 
-    ``contacts`` are their numbers among ``stencil`` and ``points``, β, unit normals, normal forces and k of
-    the barrier.
-    ``previous`` (E,) is the row of the same contact in ``old`` (M, 35), or −1.
+    ``pair`` (E,) are their numbers among ``stencil`` and ``points``, ``normal`` (E, 3) unit normals.
     """
-    pairs, beta, normal, force, stiffness = contacts
+    tangents, gradients, starts, contact_point, factor = out
     p, rotation = np.empty((4, 3)), np.empty((4, 3))
-    for m in range(len(pairs)):
-        e, side, normal_slip = pairs[m], 0.0, 0.0
-        for k in range(6):
-            data[m, k] = keys[m, 4 + k]
+    for m in range(len(pair)):
+        e, side, distance = pair[m], 0.0, 0.0
         for i in range(4):
-            sheet_beta = beta[m, i] if points[e, i] >= 0 else 0.0
-            data[m, BETA + i] = sheet_beta
-            side += sheet_beta
-        distance = 0.0
+            beta[m, i] = beta[m, i] if points[e, i] >= 0 else 0.0
+            side += beta[m, i]
         for k in range(3):
-            start = 0.0
+            place = 0.0
             for i in range(4):
-                start += data[m, BETA + i] * x[Index(stencil[e, i]), k]
-            data[m, NORMAL + k], data[m, START + k] = normal[m, k], start
-            data[m, CONTACT + k] = side * start if abs(side) > 0.5 else 0.0  # 0 between sheets
-            data[m, SLIP + k] = old[previous[m], SLIP + k] if previous[m] >= 0 else 0.0
-            normal_slip += data[m, SLIP + k] * normal[m, k]
-            distance += start * normal[m, k]
-        data[m, FACTOR], rotation[:] = 1.0, 0.0
+                p[i, k] = x[Index(stencil[e, i]), k]
+                place += beta[m, i] * p[i, k]
+            distance += place * normal[m, k]
+            contact_point[m, k] = side * place if abs(side) > 0.5 else 0.0  # 0 between sheets
+        factor[m], rotation[:] = 1.0, 0.0
         if keys[m, 5] < 0:
-            for i in range(4):
-                for k in range(3):
-                    p[i, k] = x[Index(stencil[e, i]), k]
             lever = rotation_vectors(p, keys[m, 4], normal[m], rotation)
-            data[m, FACTOR] = min(lever / (LEVER * distance) ** 2, 1.0)
-        for i in range(1, 4):
-            height = 0.0
-            for k in range(3):
-                rotation[i, k] *= distance
-                height += normal[m, k] * (x[Index(stencil[e, i]), k] - x[Index(stencil[e, 0]), k])
-            for k in range(3):
-                data[m, ROTATION + 3 * i - 3 + k] = rotation[i, k]
-                data[m, START + k] += height * rotation[i, k]
-        for k in range(3):
-            data[m, SLIP + k] -= normal_slip * normal[m, k]
-        data[m, SLID], data[m, FORCE] = old[previous[m], SLID] if previous[m] >= 0 else 0.0, force[m]
-        data[m, STIFFNESS] = stiffness[m]
-
-
-@kernel()
-def unpack(data, beta, tangents, gradients, constant, slip, contact):  # type: ignore[no-untyped-def]
-    """Unpack data (E, 35): β (E, 4), t (E, 2, 3), w (E, 2, 4, 3), constant (E, 2), ξ (E, 3) and the contact
-    points of obstacles (E, 3).
-    """
-    for e in range(len(data)):
-        n = data[e, NORMAL], data[e, NORMAL + 1], data[e, NORMAL + 2]
+            factor[m] = min(lever / (LEVER * distance) ** 2, 1.0)
+        n = normal[m, 0], normal[m, 1], normal[m, 2]
         tangent_pair = _tangents(n)
-        for i in range(4):
-            beta[e, i] = data[e, BETA + i]
-        for k in range(3):
-            slip[e, k], contact[e, k] = data[e, SLIP + k], data[e, CONTACT + k]
         for c in range(2):
-            t, total, constant[e, c] = tangent_pair[c], 0.0, 0.0
-            for k in range(3):
-                tangents[e, c, k] = t[k]
-                constant[e, c] += t[k] * (slip[e, k] - data[e, START + k])
+            t, total, start = tangent_pair[c], 0.0, 0.0
             for i in range(3, -1, -1):
-                normal_part = -total  # Σ d_i = 0
+                turn = -total  # Σ d_i = 0
                 if i > 0:
-                    at = ROTATION + 3 * i - 3
-                    normal_part = t[0] * data[e, at] + t[1] * data[e, at + 1] + t[2] * data[e, at + 2]
-                total += normal_part
+                    turn = distance * dot(t, (rotation[i, 0], rotation[i, 1], rotation[i, 2]))
+                total += turn
                 for k in range(3):
-                    gradients[e, c, i, k] = beta[e, i] * t[k] + normal_part * n[k]
+                    gradients[m, c, i, k] = beta[m, i] * t[k] + turn * n[k]
+                    start += gradients[m, c, i, k] * p[i, k]
+            starts[m, c] = start
+            for k in range(3):
+                tangents[m, c, k] = t[k]
 
 
 @leaf()
@@ -436,12 +392,12 @@ def _precedes(keys, a, others, b):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def match_pairs(keys, old, data, rows):  # type: ignore[no-untyped-def]
+def match_pairs(keys, old, slip, forces, rows):  # type: ignore[no-untyped-def]
     """Find the row of old (M, 10) that each of keys (N, 10) continues, −1 for none; both are in ascending
     order.
 
-    Of several equally similar pairs the one with the longest elastic slip in data (M, 35) is chosen; of
-    sliding pairs, which have equal elastic slip, the one with the largest normal force.
+    Of several equally similar pairs the one with the longest elastic slip (M, 3) is chosen; of sliding pairs,
+    which have equal elastic slip, the one with the largest of the normal ``forces`` (M,).
     """
     size = 1
     while size < 2 * len(old):
@@ -464,9 +420,9 @@ def match_pairs(keys, old, data, rows):  # type: ignore[no-untyped-def]
             if old[b, 0] == keys[a, 0]:
                 fits, length = _similarity(keys, a, old, b), 0.0
                 for k in range(3):
-                    length += data[b, SLIP + k] * data[b, SLIP + k]
-                force, longer = data[b, FORCE], length > longest * (1.0 + LENGTH_TOLERANCE)
-                longer = longer or (length >= longest * (1.0 - LENGTH_TOLERANCE) and force > largest)
+                    length += slip[b, k] * slip[b, k]
+                force, longer = forces[b], length > longest * (1.0 + TIE)
+                longer = longer or (length >= longest * (1.0 - TIE) and force > largest)
                 if fits >= 0 and (fits > best_fit or (fits == best_fit and longer)):
                     rows[a], best_fit, longest, largest = b, fits, length, force
             b = link[b]

@@ -25,9 +25,11 @@ from typing import NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints, Mask
-from lyra_petsc.contact.barrier import ContactBarrier, Contacts
-from lyra_petsc.contact.friction import CoulombFriction, EndFriction, ObstacleMotion
-from lyra_petsc.contact.obstacle_points import ObstaclePositions
+from lyra_petsc.contact.barrier import ContactBarrier
+from lyra_petsc.contact.friction import CoulombFriction, ObstacleMotion
+from lyra_petsc.contact.friction_step import EndFriction
+from lyra_petsc.contact.obstacle_points import ObstaclePositions, obstacle_loads
+from lyra_petsc.contact.pairs import Contacts, FrictionPairs, Rows
 from lyra_petsc.mesh.points import Layout
 
 END = 1e-3
@@ -106,7 +108,7 @@ class ContactImpulses(NamedTuple):
     work, heat : float
         Work of the obstacles by the impulses, and energy that became heat [J].
     obstacle, loads : (m,), (m, 8)
-        Numbers of obstacles, and loads on them as in `ContactBarrier.obstacle_forces`.
+        Numbers of obstacles, and loads on them as from `obstacle_points.obstacle_loads`.
     """
 
     change: Array
@@ -125,8 +127,8 @@ def end_step(
     motion: ObstacleMotion | None,
 ) -> ContactImpulses:
     """All impulses at the end of a step that something may touch in."""
-    contacts = barrier.contacts(step.x, step.v, obstacles, step.last_times)
-    damped, push = _damp(step, contacts)
+    contacts = barrier.find_contacts(step.x, obstacles.end)
+    damped, push = _damp(step, barrier, contacts)
     if friction is None or motion is None:
         return damped
     damped_v = step.v + step.layout.extended(damped.change)
@@ -141,22 +143,24 @@ def end_step(
     )
 
 
-def _damp(step: StepEnd, contacts: Contacts) -> tuple[ContactImpulses, Array]:
+def _damp(step: StepEnd, barrier: ContactBarrier, contacts: Contacts) -> tuple[ContactImpulses, Array]:
     """Damp the rates at which distances in contact change; returns also the forces (m,) [N].
 
     A pair with the rate r gets the impulse −w r of a dashpot, which keeps second order, with
     w/m = 1 − e^−q, q = 2 √(Δt² b″/m), m of `_pair_masses`.
     """
-    points, beta, dt = contacts.points, contacts.sheet_beta, step.dt
-    mass = _pair_masses(step, points, np.abs(beta), contacts.stiffness)
-    rate = np.einsum("ei,eik,ek->e", beta, step.v[points], contacts.normal)
-    approach = np.einsum("ek,ek->e", contacts.velocity, contacts.normal)
-    q = 2.0 * dt * np.sqrt(contacts.stiffness / np.maximum(mass, np.finfo(float).tiny))
+    rows, beta, dt = contacts.rows, contacts.sheet_beta, step.dt
+    stiffness, pairs = barrier.contact_stiffness(contacts), (rows, beta, contacts.obstacle)
+    mass = _pair_masses(step, rows, np.abs(beta), stiffness)
+    rate = np.einsum("ei,eik,ek->e", beta, step.v[rows], contacts.normal)
+    velocity = barrier.obstacles.contact_velocities(step.x, step.v, *pairs, step.last_times)
+    approach = np.einsum("ek,ek->e", velocity, contacts.normal)
+    q = 2.0 * dt * np.sqrt(stiffness / np.maximum(mass, np.finfo(float).tiny))
     push = np.maximum(mass * np.expm1(-q) * (rate - approach) / dt, -contacts.force)
     along = push[:, None] * contacts.normal
-    impulse = _sums(points, dt * beta[:, :, None] * along[:, None, :], len(step.x))
+    impulse = _sums(rows, dt * beta[:, :, None] * along[:, None, :], len(step.x))
     change, heat = _applied(step, impulse, work := dt * float(push @ approach))
-    loads = _loads(step, points, beta, contacts.obstacle, along, push)
+    loads = obstacle_loads(step.x, *pairs, along, np.column_stack([push, np.zeros_like(push)]))
     return ContactImpulses(change, step.handle_force(impulse), work, heat, *loads), push
 
 
@@ -168,18 +172,15 @@ def _slide(
     """
     dt = step.dt
     friction = term.end_friction(step.x, step.v, motion, contacts, normal_force, step.last_times)
-    points, gradients = friction.points, friction.gradients
-    of_obstacles = np.einsum("eck,ek->ec", friction.tangents, friction.velocity)
-    mass = _pair_masses(step, points, _sizes(gradients, friction.beta), friction.normal_force) / dt
+    rows, pairs, of_obstacles = friction.rows, friction.pairs, friction.velocity
+    mass = _pair_masses(step, rows, _sizes(pairs), pairs.force) / dt
 
     def rates(v: Array) -> Array:
-        relative: Array = np.einsum("ecik,eik->ec", gradients, v[points]) - of_obstacles
-        return relative
+        return pairs.displacement(v[rows]) - of_obstacles
 
     def after(force: Array) -> tuple[Array, Array]:
         """Impulses (n_local, 3) of a friction (m, 2), and the velocities (n_local, 3) after them."""
-        pull = np.einsum("ec,ecik->eik", force - friction.applied, gradients)
-        impulse = _sums(points, dt * pull, len(step.x))
+        impulse = _sums(rows, dt * pairs.pulls(force - friction.applied), len(step.x))
         return impulse, step.v + step.layout.extended(step.accelerations(impulse))
 
     force, before = friction.force - friction.applied, rates(step.v)
@@ -199,8 +200,8 @@ def _slide(
     of_change = -0.5 * dt * float(np.vdot(changed, before + relative))
     sliding = np.where(sticks, 0.0, -dt * np.einsum("ec,ec->e", force, relative))
     term.set_end_friction(friction, force, sticks, sliding)
-    along = np.einsum("ec,eck->ek", changed, friction.tangents)
-    loads = _loads(step, points, friction.beta, friction.obstacle, along, np.zeros(len(along)))
+    along, no_size = np.einsum("ec,eck->ek", changed, pairs.tangents), np.zeros_like(changed)
+    loads = obstacle_loads(step.x, rows, pairs.beta, pairs.obstacle, along, no_size)
     handle_force, change = step.handle_force(impulse), (v - step.v)[: len(own)]
     return ContactImpulses(change, handle_force, work - of_change, heat - of_change, *loads)
 
@@ -211,12 +212,11 @@ def _coulomb(
     """Friction (m, 2) [N] of pairs with relative velocities (m, 2) [m/s] under the friction ``force`` (m, 2)
     [N], and which of them stick; ``mass`` (m,) [kg/s] is the mass over Δt.
     """
-    moves = friction.slides | (dt * np.linalg.norm(velocity, axis=1) > friction.still)
+    slides = friction.pairs.slides
+    moves = slides | (dt * np.linalg.norm(velocity, axis=1) > friction.still)
     stopping = force - np.where(moves, mass, 0.0)[:, None] * velocity
     size = np.linalg.norm(stopping, axis=1)
-    # a spring that still yields less than its limit need not stop the pair within the step
-    holds = friction.held & (np.linalg.norm(friction.force, axis=1) <= friction.static)
-    sticks = holds | (size <= np.where(friction.slides, friction.kinetic, friction.static))
+    sticks = friction.holds | (size <= np.where(slides, friction.kinetic, friction.static))
     limit = np.where(sticks, friction.static, friction.kinetic)
     return stopping * np.minimum(limit / np.maximum(size, 1e-300), 1.0)[:, None], sticks
 
@@ -232,21 +232,21 @@ def hold_by_friction(
     velocities of ``step``, as far as its limit allows. (Projected gradients with momentum: Nesterov, Soviet
     Mathematics Doklady 27 (1983) 372-376.)
     """
-    points, gradients, beta, weight, limit, elastic, moved = term.starting_friction(motion)
+    start, elastic, moved = term.starting_friction(motion)
+    rows, pairs, limit = start.rows, start.pairs, start.limit
     layout, dt, n = step.layout, step.dt, len(step.v)
     largest = layout.global_max(float(limit.max(initial=0.0)))[0]
     if not largest > 0.0:
         return acceleration
-    stopped = _pair_masses(step, points, _sizes(gradients, beta), weight)
+    stopped = _pair_masses(step, rows, _sizes(pairs), pairs.force)
 
     def with_friction(friction: Array) -> Array:
-        pull = _sums(points, np.einsum("ec,ecik->eik", friction - elastic, gradients), n)
-        return acceleration + step.accelerations(pull)
+        return acceleration + step.accelerations(_sums(rows, pairs.pulls(friction - elastic), n))
 
     friction = tried = elastic
     for sweep in range(MAX_SWEEPS):
         a = layout.extended(with_friction(tried))
-        rate = np.einsum("ecik,eik->ec", gradients, (step.v + 0.5 * dt * a)[points]) + moved / dt
+        rate = pairs.displacement((step.v + 0.5 * dt * a)[rows]) + moved / dt
         after = tried - 2.0 / dt * stopped[:, None] * rate
         after *= np.minimum(1.0, limit / np.maximum(np.linalg.norm(after, axis=1), 1e-300))[:, None]
         change = float(np.abs(after - tried).max(initial=0.0))
@@ -257,22 +257,23 @@ def hold_by_friction(
     return with_friction(friction)
 
 
-def _sizes(gradients: Array, beta: Array) -> Array:
-    """Largest norms (m, 4) of ``gradients`` (m, 2, 4, 3) over all tangential directions.
+def _sizes(pairs: FrictionPairs) -> Array:
+    """Largest norms (m, 4) of the gradients of pairs over all tangential directions.
 
     A gradient β t + (d · t) n is longest for t along d, and has the length |β| for t perpendicular to d.
     """
-    return np.sqrt(np.maximum((gradients * gradients).sum(axis=(1, 3)) - beta * beta, 0.0))
+    square = (pairs.gradients * pairs.gradients).sum(axis=(1, 3)) - pairs.beta * pairs.beta
+    return np.sqrt(np.maximum(square, 0.0))
 
 
-def _sums(points: Ints, values: Array, n: int) -> Array:
+def _sums(points: Rows, values: Array, n: int) -> Array:
     """Sums (n, 3) of ``values`` (m, 4, 3) over the rows ``points`` (m, 4)."""
     rows = points.reshape(-1)
     columns = [np.bincount(rows, column, n) for column in values.reshape(-1, 3).T]
     return np.stack(columns, axis=1).astype(np.float64)
 
 
-def _pair_masses(step: StepEnd, points: Ints, size: Array, weight: Array) -> Array:
+def _pair_masses(step: StepEnd, points: Rows, size: Array, weight: Array) -> Array:
     """Masses m (m,) [kg] that pairs of this rank may stop, whose gradients have the norms ``size`` (m, 4).
 
     The masses of vertices are divided in proportion to ``weight`` (m,), so that a pair that hardly touches
@@ -290,20 +291,6 @@ def _pair_masses(step: StepEnd, points: Ints, size: Array, weight: Array) -> Arr
     inverse = step.layout.extended(inverse)
     largest = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0)
     return np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0.0)
-
-
-def _loads(
-    step: StepEnd, points: Ints, beta: Array, obstacle: Ints, force: Array, normal_force: Array
-) -> tuple[Ints, Array]:
-    """Numbers of obstacles and loads (m, 8) on them by forces β times ``force`` (m, 3) [N] on the points of
-    sheets, of which ``normal_force`` (m,) [N] are the normal forces.
-    """
-    on = np.flatnonzero(obstacle >= 0)
-    side = beta[on].sum(axis=1, keepdims=True)
-    at = np.einsum("ei,eik->ek", beta[on], step.x[points[on]]) / side
-    on_obstacle = -side * force[on]
-    magnitudes = np.column_stack([normal_force[on], np.zeros(len(on))])
-    return obstacle[on], np.hstack([on_obstacle, np.cross(at, on_obstacle), magnitudes])
 
 
 def _applied(step: StepEnd, impulse: Array, work: float) -> tuple[Array, float]:

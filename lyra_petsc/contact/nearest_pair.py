@@ -75,7 +75,7 @@ def blocking_pair(contact: SceneContact, x: Array, frozen: ObstaclePositions) ->
 def nearest_obstacle(contact: SceneContact, x: Array, frozen: ObstaclePositions) -> NearPair | None:
     """The nearest touching pair with an obstacle at positions x (n_local, 3); collective."""
     barrier, gaps = contact.barrier, contact.barrier.gaps(x, frozen)
-    touches = (gaps < 2.0 * contact.skin) & (barrier.obstacle[: len(gaps)] >= 0)
+    touches = (gaps < 2.0 * contact.skin) & (barrier.pairs.obstacle[: len(gaps)] >= 0)
     return _worst(contact, x, frozen, np.where(touches, _nearness(contact, gaps), 0.0))
 
 

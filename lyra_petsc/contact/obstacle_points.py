@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import surface_shares
+from lyra_petsc.contact.pairs import Rows
 from lyra_petsc.mesh.obstacles import Container, Solid
 
 SHARP_ANGLE = 0.5
@@ -190,7 +191,7 @@ class Obstacles:
         return motions
 
     def contact_displacements(
-        self, x: Array, points: Ints, beta: Array, obstacle: Ints, motions: list[tuple[Array, Array]]
+        self, x: Array, points: Rows, beta: Array, obstacle: Ints, motions: list[tuple[Array, Array]]
     ) -> Array:
         """Displacements (m, 3) [m] of obstacles at their contacts, times Σ β_i of the sheet's points.
 
@@ -229,6 +230,20 @@ class Obstacles:
             for at, times in ((x, last), (x - duration * v, last[::-1]))
         )
         return 0.5 * (moved - back) / duration
+
+
+def obstacle_loads(
+    x: Array, rows: Rows, beta: Array, obstacle: Ints, force: Array, sizes: Array
+) -> tuple[Ints, Array]:
+    """Numbers of obstacles and loads (m, 8) on them by forces β times ``force`` (E, 3) [N] on vertices in
+    local rows (E, 4): force [N], torque [N m] about the origin, and the two ``sizes`` (E, 2) [N].
+
+    Pairs between sheets, whose obstacle (E,) is −1, have none.
+    """
+    on = np.flatnonzero(obstacle >= 0)
+    side = beta[on].sum(axis=1, keepdims=True)
+    place, load = np.einsum("ei,eik->ek", beta[on], x[rows[on]]) / side, -side * force[on]
+    return obstacle[on], np.hstack([load, np.cross(place, load), sizes[on]])
 
 
 def _triangle_edges(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:

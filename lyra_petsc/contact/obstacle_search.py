@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.contact import contact_pairs
-from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
+from lyra_petsc.contact import pair_distances
 from lyra_petsc.contact.near import overlapping_pairs, swept_boxes
 from lyra_petsc.contact.obstacle_points import Obstacles
+from lyra_petsc.contact.pair_distances import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
 from lyra_petsc.contact.sheet_search import SheetSearch, Simplices
 
 
@@ -52,7 +52,7 @@ class ObstacleSearch:
         _, to_stage, to_end = self.x - start
         farther = np.linalg.norm(to_end, axis=1) > np.linalg.norm(to_stage, axis=1)
         longer = np.where(farther[:, None], to_end, to_stage)
-        contact_pairs.swept_distance_bounds(x, start, dx, longer, kinds, points, radius, bounds)
+        pair_distances.swept_distance_bounds(x, start, dx, longer, kinds, points, radius, bounds)
         return np.column_stack([kinds, obstacle, points, rings])[bounds < radius]
 
     def pairs(self, x: Array, dx: Array, boxes: Array, walled: NDArray[np.bool_]) -> list[Ints]:
@@ -146,7 +146,7 @@ class ObstacleSearch:
         pairs = np.column_stack([np.repeat(np.arange(n), m), np.tile(~others[:, :3], (n, 1))])
         kinds, out, smallest = np.full(n * m, kind), np.empty(n * m), np.full((n, m), np.inf)
         for positions in obstacle_x:
-            contact_pairs.distances(points, positions, kinds, pairs, out)
+            pair_distances.distances(points, positions, kinds, pairs, out)
             smallest = np.minimum(smallest, out.reshape(n, m))
         smallest -= self._obstacles.radius[others[:, 3]]
         return smallest < np.reshape(radius, (-1, 1))

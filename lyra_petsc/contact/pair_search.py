@@ -18,7 +18,14 @@ from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.contact.friction import CoulombFriction
 from lyra_petsc.contact.near import swept_boxes
-from lyra_petsc.contact.pairs import NearPairs, no_near_pairs
+from lyra_petsc.contact.pairs import (
+    FrictionPairs,
+    NearPairs,
+    chosen,
+    joined,
+    no_friction_pairs,
+    no_near_pairs,
+)
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.sorting import sort_rows
 from lyra_petsc.linear.discretisation import Discretisation
@@ -90,8 +97,7 @@ class PairSearch:
         self._discretisation, self._barrier, self._friction = discretisation, barrier, friction
         self.near = False
         self._pairs = no_near_pairs()
-        none = np.empty((0, 4), dtype=np.int64), np.empty((0, 0))
-        self._friction_pairs = none if friction is None else friction.current_pairs()
+        self._friction_pairs = no_friction_pairs()
         # of the last search: positions and displacements (n, 3) [m], and over all ranks the products of both,
         # and of the displacements [m²]
         self._path: tuple[Array, Array] | None = None
@@ -121,31 +127,28 @@ class PairSearch:
             barrier.search.obstacles_have_moved,
             friction is not None and friction.pairs_have_changed,
         )
-        searches, before = bool(leaves or moved), (self._pairs, self._friction_pairs)
+        searches = leaves or moved
         if not (searches or changed):
             return
+        of_barrier, of_friction = len(self._pairs.kind), len(self._friction_pairs.key)
         if searches:
             self._search_ahead(x, np.zeros_like(x) if expected is None else expected, ahead)
         if friction is not None and changed:
-            self._friction_pairs = self._exchanged(*friction.current_pairs())
-        renews = [
-            now is not old and (len(now[0]) > 0 or len(old[0]) > 0)
-            for now, old in zip((self._pairs, self._friction_pairs), before, strict=True)
-        ]
+            self._friction_pairs = self._exchanged(friction.take_equation_pairs())
         others = self._add_ghosts()
-        if others or renews[0]:
+        if others or (searches and of_barrier + len(self._pairs.kind) > 0):
             self._give_barrier_pairs()
-        if friction is not None and (others or renews[1]):
+        if friction is not None and (others or (changed and of_friction + len(self._friction_pairs.key) > 0)):
             self._give_friction_pairs(friction)
 
     def _add_ghosts(self) -> bool:
         """Add the rows of other ranks that pairs need to the ghosts; returns whether any were missing."""
         layout = self._layout
-        found = [self._pairs.vertices, self._friction_pairs[0]]
+        stencils = [self._pairs.vertices, self._friction_pairs.vertices]
         more, end = layout.ghosts[:0], layout.start + layout.n_owned
-        any_here = any(len(vertices) for vertices in found)
+        any_here = any(len(vertices) for vertices in stencils)
         if any_here:
-            beyond = [vertices[(vertices < layout.start) | (vertices >= end)] for vertices in found]
+            beyond = [vertices[(vertices < layout.start) | (vertices >= end)] for vertices in stencils]
             more = np.setdiff1d(np.concatenate(beyond), self._discretisation.fixed_ghosts)
         missing = len(more) > 0 and not np.isin(more, layout.ghosts).all()
         others, self.near = (flag > 0.0 for flag in layout.global_max(missing, any_here))
@@ -170,18 +173,18 @@ class PairSearch:
         # sorted, so that the same pairs give the same stencil after every search
         parts = [sort_rows(part, keys) for part in self._counted(pairs.vertices)]
         order = np.concatenate(parts)
-        pairs = NearPairs(*(values[order] for values in pairs))
+        pairs = chosen(pairs, order)
         stencil = self._local(pairs.vertices)
         self._discretisation.replace_stencil(self._barrier, stencil)
         self._barrier.set_pairs(pairs, stencil, len(parts[0]))
 
     def _give_friction_pairs(self, friction: CoulombFriction) -> None:
-        vertices, data = self._friction_pairs
-        parts = self._counted(vertices)
-        order = np.concatenate(parts)
-        stencil = self._local(vertices[order])
+        pairs = self._friction_pairs
+        parts = self._counted(pairs.vertices)
+        pairs = chosen(pairs, np.concatenate(parts))
+        stencil = self._local(pairs.vertices)
         self._discretisation.replace_stencil(friction, stencil)
-        friction.set_pairs(stencil, data[order], len(parts[0]))
+        friction.set_pairs(pairs, stencil, len(parts[0]))
 
     def _search_ahead(self, x: Array, expected: Array, ahead: Callable[[int], Array] | None) -> None:
         """Search along ``expected`` (n_local, 3), or the displacement of several steps.
@@ -239,7 +242,7 @@ class PairSearch:
         if not self._square > 0.0:
             return [0.0] * len(positions)
         along = self._layout.global_sum(*[float(np.vdot(x, self._path[1])) for x in positions]).tolist()
-        return [min(max((each - self._begin) / self._square, 0.0), 1.0) for each in along]
+        return [min(max((product - self._begin) / self._square, 0.0), 1.0) for product in along]
 
     def _are_near_path(self, radius: float, *positions: Array) -> bool:
         """Whether this rank's vertices are within ``radius`` [m] of one place on the path, at each of several
@@ -256,11 +259,11 @@ class PairSearch:
         fraction that was searched.
         """
         for part in FRACTIONS:
-            found = self._near_pairs(x, part * displacement)
-            if not any(self._layout.global_max(found is None)):
+            pairs = self._near_pairs(x, part * displacement)
+            if not any(self._layout.global_max(pairs is None)):
                 break
-        assert found is not None
-        self._fraction, self._pairs = part, found
+        assert pairs is not None
+        self._fraction, self._pairs = part, pairs
         return part
 
     def _with_marks(self, triangles: Ints) -> Ints:
@@ -302,7 +305,7 @@ class PairSearch:
         touching = np.flatnonzero(
             ((pairs.vertices >= layout.start) & (pairs.vertices < layout.start + n)).any(axis=1)
         )
-        return NearPairs(*(values[touching] for values in pairs))
+        return chosen(pairs, touching)
 
     def _gather_near(self, numbers: Ints, rows: Ints, x: Array, u: Array, mine: Mask) -> tuple[Ints, Array]:
         """Triangles of other ranks near the bounding box of those of this rank.
@@ -339,14 +342,12 @@ class PairSearch:
         received += [part for part in comm.alltoall(sent) if part is not None]
         return np.concatenate([part[0] for part in received]), np.concatenate([part[1] for part in received])
 
-    def _exchanged(self, vertices: Ints, data: Array) -> tuple[Ints, Array]:
-        """Pairs (E, 4) of this rank in global numbers, and those of others on its vertices."""
+    def _exchanged(self, pairs: FrictionPairs) -> FrictionPairs:
+        """Pairs of this rank, and those of others on its vertices."""
         comm, bounds = self._layout.comm, self._layout.bounds
         if comm.size == 1:
-            return vertices, data
-        owners = np.searchsorted(bounds, vertices, side="right") - 1
-        parts = [(owners == rank).any(axis=1) for rank in range(comm.size)]
-        sent = [None if rank == comm.rank else (vertices[at], data[at]) for rank, at in enumerate(parts)]
-        received = [part for part in comm.alltoall(sent) if part is not None]
-        numbers, parts_of_data = zip((vertices, data), *received, strict=True)
-        return np.concatenate(numbers), np.concatenate(parts_of_data)
+            return pairs
+        owners = np.searchsorted(bounds, pairs.vertices, side="right") - 1
+        on_rank = [(owners == rank).any(axis=1) for rank in range(comm.size)]
+        sent = [None if rank == comm.rank else chosen(pairs, rows) for rank, rows in enumerate(on_rank)]
+        return joined([pairs, *(part for part in comm.alltoall(sent) if part is not None)])

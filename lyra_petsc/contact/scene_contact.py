@@ -127,10 +127,11 @@ class SceneContact:
         friction, layout = self.friction, self.layout
         if friction is None or not self.near:
             return False
-        change, total = layout.global_sum(*friction.changed_contacts(x, start, frozen[friction])).tolist()
+        pairs, *forces = friction.changed_contacts(x, start, frozen[friction])
+        change, total = layout.global_sum(*forces).tolist()
         if change <= FOLLOWED * total:
             return False
-        friction.take_contacts()
+        friction.take_contacts(pairs)
         return True
 
     def acting(self, x: Array, frozen: Frozen) -> dict[str, Mask]:

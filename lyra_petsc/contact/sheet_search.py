@@ -10,9 +10,9 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import patches
-from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, approach_bound, distance
 from lyra_petsc.contact.distance_bounds import DistanceBounds
 from lyra_petsc.contact.near import near_pairs_by_tree
+from lyra_petsc.contact.pair_distances import EDGE_EDGE, VERTEX_TRIANGLE, approach_bound, distance
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import inlined, kernel, leaf
 from lyra_petsc.mesh.topology import connected_pieces, edge_table

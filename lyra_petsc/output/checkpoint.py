@@ -24,6 +24,7 @@ from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.run_folder import RUN
 from lyra_petsc.output.stored import check_sums, open_stored
 from lyra_petsc.parallel import on_root
+from lyra_petsc.stepping.term_states import VERTICES
 
 LARGEST = 1e50
 """Largest magnitude of a number [SI]; energies of larger positions overflow."""
@@ -51,7 +52,7 @@ class Checkpoint:
     edges : dict of str to (n_edges,) array
         Unknowns of edges by name, in this rank's numbering.
     elements : dict of str to (n, m) array
-        Rows of changing elements by name, divided evenly among the ranks.
+        Arrays of elements by name, divided evenly among the ranks.
     """
 
     arrays: dict[str, NDArray[Any]]
@@ -145,14 +146,13 @@ class TermArrays(NamedTuple):
         Names of those on vertices; a term that the checkpoint does not know has none there.
     edges : set of str
         Names of those on edges.
-    elements : mapping of str to (int, int)
-        For each term with changing elements the number of vertices of an element, with whose numbers its row
-        begins, and the length of the row.
+    elements : mapping of str to int
+        Number of columns of those of elements. The terms' `VERTICES` are numbers of vertices.
     """
 
     vertices: Set[str] = frozenset()
     edges: Set[str] = frozenset()
-    elements: Mapping[str, tuple[int, int]] = MappingProxyType({})
+    elements: Mapping[str, int] = MappingProxyType({})
 
 
 NO_TERMS = TermArrays()
@@ -194,8 +194,9 @@ def read_checkpoint(
                 kind, name = path.split("/", 1)
                 by = {"vertices": order, "edges": edge_order}.get(kind) or _equal_slabs(order.comm, shape[0])
                 slab = read_slab(file, path, by)
-                n_numbers = terms.elements[name][0] if kind == "elements" else 0
-                problem = _problem_of(slab, total, order, n_numbers)
+                problem = _problem_of(
+                    slab, total, order, numbers=kind == "elements" and name.endswith(f".{VERTICES}")
+                )
                 if problem:
                     raise InputError(f"checkpoint is damaged: {path} {problem}", file=file)
                 arrays[kind][name] = by.from_slab(slab)
@@ -260,9 +261,10 @@ def _needed_arrays(
     shapes: dict[str, tuple[int, ...]] = {f"vertices/{name}": (n_vertices, 3) for name in of_vertices}
     if n_edges:
         shapes |= {f"edges/{name}": (n_edges,) for name in own | terms.edges}
-    for name, (_, columns) in terms.elements.items():
-        if f"elements/{name}" in stored:
-            shapes[f"elements/{name}"] = (*stored[f"elements/{name}"].shape[:1], columns)
+    for name, columns in terms.elements.items():
+        vertices = f"elements/{name.split('.')[0]}.{VERTICES}"
+        if vertices in stored:
+            shapes[f"elements/{name}"] = (*stored[vertices].shape[:1], columns)
     for path, shape in shapes.items():
         if path not in stored:
             raise ValueError(f"{path} is missing")
@@ -273,16 +275,16 @@ def _needed_arrays(
     return {path: stored[path] for path in sorted(shapes)}
 
 
-def _problem_of(slab: NDArray[Any], total: int, order: FileOrder, n_numbers: int) -> str:
+def _problem_of(slab: NDArray[Any], total: int, order: FileOrder, *, numbers: bool) -> str:
     """What is wrong with an array of which this rank has a slab; empty if nothing is; collective.
 
-    The first ``n_numbers`` columns are numbers of vertices.
+    ``numbers``: it holds numbers of vertices.
     """
     if int(check_sums([slab], order.comm)[0]) != total:
         return "differs from its check sum"
-    numbers = slab[:, :n_numbers] if n_numbers else slab[:0]
     plausible = (np.abs(slab) <= LARGEST).all()  # not so for NaN
-    plausible &= ((numbers >= 0) & (numbers < order.n_global) & (numbers == np.floor(numbers))).all()
+    if numbers:
+        plausible &= ((slab >= 0) & (slab < order.n_global) & (slab == np.floor(slab))).all()
     return "" if order.comm.allreduce(bool(plausible), MPI.LAND) else "holds numbers that no run writes"
 
 

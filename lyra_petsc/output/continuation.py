@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.checkpoint import Checkpoint, TermArrays
 from lyra_petsc.output.file_operations import reason
@@ -34,10 +34,8 @@ def used_groups(scene: Scene) -> set[str]:
 
 def term_arrays(simulation: SteppedScene) -> TermArrays:
     """The arrays of the scene's terms in checkpoints; collective."""
-    terms, layout = simulation.problem.terms, simulation.problem.points
-    stateful = simulation.problem.equations.active.stateful
-    widths = {name: rows.shape[1] for name, rows in term_states.element_arrays(stateful, layout).items()}
-    elements = {name: (terms[name].stencil.shape[1], n) for name, n in widths.items()}
+    layout, stateful = simulation.problem.points, simulation.problem.equations.active.stateful
+    elements = {name: rows.shape[1] for name, rows in term_states.element_arrays(stateful, layout).items()}
     vertices, edges = term_states.vertex_arrays(stateful), term_states.edge_arrays(stateful, layout)
     return TermArrays(vertices.keys(), edges.keys(), elements)
 
@@ -68,7 +66,7 @@ def restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrde
 
 
 def _restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrder) -> None:
-    scalars, terms = checkpoint.scalars, simulation.problem.terms
+    scalars = checkpoint.scalars
     equations, layout = simulation.problem.equations, simulation.problem.points
     arrays = {
         name: layout.join(values, checkpoint.edges.get(name)) for name, values in checkpoint.arrays.items()
@@ -78,15 +76,15 @@ def _restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrd
     equations.state.set(arrays["position"], arrays["velocity"])
     own = layout.start + np.arange(layout.n_vertices)
 
-    def changing_elements(n: int, rows: Array) -> tuple[Ints, Array]:
-        """Global numbers (E, n) of vertices, which the first columns give as in the file; other columns."""
-        numbers = rows[:, :n].astype(np.int64)
-        return vertices.look_up(own, numbers.ravel()).reshape(numbers.shape), rows[:, n:]
-
-    elements = {
-        name: changing_elements(terms[name].stencil.shape[1], rows)
-        for name, rows in checkpoint.elements.items()
-    }
+    values: dict[str, dict[str, Array]] = {}
+    for key, rows in checkpoint.elements.items():
+        term, name = key.split(".")
+        values.setdefault(term, {})[name] = rows
+    elements = {}
+    for term, of_term in values.items():
+        numbers = of_term.pop(term_states.VERTICES).astype(np.int64)
+        corners = vertices.look_up(own, numbers.ravel()).reshape(numbers.shape)
+        elements[term] = term_states.ElementState(corners, of_term)
     simulation.resume(arrays, scalars, checkpoint.edges, elements)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.problem import refuse_contact, refuse_overrun
 
@@ -53,7 +53,7 @@ def resume(
     arrays: Mapping[str, Array],
     scalars: Mapping[str, Any],
     edges: Mapping[str, Array],
-    elements: Mapping[str, tuple[Ints, Array]],
+    elements: Mapping[str, term_states.ElementState],
 ) -> None:
     """Continue from a `saved_state`; x and v of the owned rows are in ``run.problem.equations`` already.
 

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.linear.petsc_options import fill_gaps, unknown
@@ -38,6 +38,7 @@ from lyra_petsc.stepping.statics.stability import Stability
 from lyra_petsc.stepping.step_control import ToleranceControl
 from lyra_petsc.stepping.step_plan import planned_control
 from lyra_petsc.stepping.stepper import WOULD_CROSS, Attempt, Stepper
+from lyra_petsc.stepping.term_states import ElementState
 from lyra_petsc.stepping.ts_options import with_ts_options
 from lyra_petsc.terms.protocols import Dissipates
 
@@ -327,7 +328,7 @@ class SteppedScene:
         arrays: Mapping[str, Array],
         scalars: Mapping[str, Any],
         edges: Mapping[str, Array] = MappingProxyType({}),
-        elements: Mapping[str, tuple[Ints, Array]] = MappingProxyType({}),
+        elements: Mapping[str, ElementState] = MappingProxyType({}),
     ) -> None:
         """Continue from a `saved_state`; see `resumption`."""
         self.time, self.step_number = scalars["time"], scalars["step"]

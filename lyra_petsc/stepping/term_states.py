@@ -1,13 +1,13 @@
 """State of the terms in a checkpoint, independent of the number of ranks; collective.
 
-Entries of vertices and of edges have the key ``term.entry``. Entries of elements have the term's name, and
-each element is identified by the numbers of its vertices in the mesh.
+Entries have the key ``term.entry``. Elements are identified by the numbers of their vertices in the mesh, a
+further entry, `VERTICES`, of the term.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,25 @@ from lyra_petsc.terms.term import Elastic
 
 if TYPE_CHECKING:
     from lyra_petsc.contact.friction import CoulombFriction
+
+
+VERTICES = "vertices"
+"""Name of the entry with the numbers of the vertices of a term's elements."""
+
+
+class ElementState(NamedTuple):
+    """The state of a term's elements, each on any rank.
+
+    Attributes
+    ----------
+    vertices : (E, n)
+        Global numbers of their vertices.
+    values : mapping of (E, m)
+        By the name of the entry.
+    """
+
+    vertices: Ints
+    values: Mapping[str, Array]
 
 
 def _entries(terms: Iterable[Stateful], place: Place) -> Iterator[tuple[Stateful, str, TermState]]:
@@ -44,14 +63,15 @@ def edge_arrays(terms: Iterable[Stateful], layout: Layout) -> dict[str, Array]:
 
 
 def element_arrays(terms: Iterable[Stateful], layout: Layout) -> dict[str, Array]:
-    """Rows (E, n + m) of owned elements, by term: n mesh numbers of vertices, then m values."""
+    """The terms' arrays (E, m) of owned elements, and mesh numbers (E, n) of their vertices, by key."""
     arrays = {}
-    for term, _, entry in _entries(terms, Place.ELEMENT):
+    for term, name, entry in _entries(terms, Place.ELEMENT):
         vertices, values = entry.vertices, entry.values
         if vertices is None:
             vertices, values = layout.global_number[term.stencil[: term.n_owned]], values[: term.n_owned]
         numbers = layout.mesh_vertex_of_local()[layout.local(vertices.ravel())].reshape(vertices.shape)
-        arrays[term.name] = np.concatenate([numbers, values], axis=1)
+        arrays[f"{term.name}.{VERTICES}"] = numbers.astype(np.float64)
+        arrays[f"{term.name}.{name}"] = values
     return arrays
 
 
@@ -61,12 +81,11 @@ def restore_fixed(
     x: Array,
     arrays: Mapping[str, Array],
     edges: Mapping[str, Array],
-    elements: Mapping[str, tuple[Ints, Array]],
+    elements: Mapping[str, ElementState],
 ) -> None:
     """Restore the state of vertices, edges, and elements with fixed stencils, at positions x (n_local, 3).
 
-    A term that a checkpoint knows nothing of keeps its state. ``elements`` has for each term the global
-    numbers (E, n) of vertices and the values (E, m) of elements, each on any rank.
+    A term that a checkpoint knows nothing of keeps its state. ``elements`` is by the name of the term.
     """
     for term in terms:
         state = {}
@@ -77,8 +96,8 @@ def restore_fixed(
             elif entry.place is Place.EDGE and key in edges:
                 state[name] = _of_local_edges(layout, term, edges[key])
             elif entry.place is Place.ELEMENT and entry.vertices is None and term.name in elements:
-                rows = _send_to_owners(layout, *elements[term.name])
-                state[name] = _in_order(layout.global_number[term.stencil], *rows, entry.values)
+                rows, own = _send_to_owners(layout, elements[term.name]), layout.global_number[term.stencil]
+                state[name] = _in_order(own, rows.vertices, rows.values[name], entry.values)
         if state:
             term.restore(state, x)
 
@@ -86,24 +105,25 @@ def restore_fixed(
 def restore_changing(
     friction: CoulombFriction,
     layout: Layout,
-    elements: tuple[Ints, Array],
+    elements: ElementState,
     places: Mapping[str, tuple[int, int]],
 ) -> None:
     """Restore the state of elements with changing stencils (pairs that are near).
 
     ``places`` are the numbers of obstacles and of their first points in the checkpoint, by name.
     """
-    friction.restore_pairs(*_send_to_owners(layout, *elements), places)
+    friction.restore_pairs(*_send_to_owners(layout, elements), places)
 
 
-def _send_to_owners(layout: Layout, vertices: Ints, values: Array) -> tuple[Ints, Array]:
+def _send_to_owners(layout: Layout, elements: ElementState) -> ElementState:
     """Exchange elements so that each rank gets those with a vertex that it owns."""
-    comm = layout.comm
+    comm, (vertices, by_name) = layout.comm, elements
     owner = np.searchsorted(layout.bounds, vertices, side="right") - 1
     sent = [np.flatnonzero((owner == rank).any(axis=1)) for rank in range(comm.size)]
-    received = comm.alltoall([(vertices[rows], values[rows]) for rows in sent])
-    vertices, values = (np.concatenate(part) for part in zip(*received, strict=True))
-    return vertices, values
+    arrays = vertices, *by_name.values()
+    received = comm.alltoall([[values[rows] for values in arrays] for rows in sent])
+    vertices, *parts = (np.concatenate(part) for part in zip(*received, strict=True))
+    return ElementState(vertices, dict(zip(by_name, parts, strict=True)))
 
 
 def _edge_indices(term: Elastic) -> Ints:

@@ -61,7 +61,7 @@ class Stateful(Elastic):
 
     @abstractmethod
     def state(self) -> Mapping[str, TermState]:
-        """The state by name; at most one entry belongs to elements."""
+        """The state by name."""
 
     @abstractmethod
     def restore(self, values: Mapping[str, Array], x: Array) -> None:

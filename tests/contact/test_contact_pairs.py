@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lyra_petsc.contact import contact_pairs, surface_shares
-from lyra_petsc.contact.contact_pairs import (
-    CCD_TOLERANCE,
+from lyra_petsc.contact import contact_pairs, pair_distances, pair_motion, surface_shares
+from lyra_petsc.contact.pair_distances import (
     EDGE_EDGE,
     VERTEX_INSIDE,
     VERTEX_PLANE,
     VERTEX_TRIANGLE,
 )
+from lyra_petsc.contact.pair_motion import CCD_TOLERANCE
 from lyra_petsc.terms.position_cache import unwritable
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ class Pairs:
     def distances(self, x: Array | None = None, obstacle_x: Array | None = None) -> Array:
         out = np.empty(len(self))
         x, obstacle_x = self.x if x is None else x, self.obstacle_x if obstacle_x is None else obstacle_x
-        contact_pairs.distances(x, obstacle_x, self.kind, self.points, out)
+        pair_distances.distances(x, obstacle_x, self.kind, self.points, out)
         return out
 
     def find_active(self, x: Array, parallel: float) -> tuple[NDArray[np.bool_], Array, Array]:
@@ -95,7 +95,7 @@ class Pairs:
     def largest_step(self, dx: Array, obstacle_dx: Array, e: int | None = None, most: float = 1.0) -> float:
         at = slice(None) if e is None else slice(e, e + 1)
         pairs = self.kind[at], self.points[at], self.offset[at], np.full(len(self), GAP)[at]
-        return float(contact_pairs.largest_step(self.x, self.obstacle_x, dx, obstacle_dx, *pairs, KEPT, most))
+        return float(pair_motion.largest_step(self.x, self.obstacle_x, dx, obstacle_dx, *pairs, KEPT, most))
 
 
 ACTIVE_COLUMNS = ["at", "weight", "beta", "derivatives"]

@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.contact import friction_pairs
-from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
-from lyra_petsc.contact.friction_pairs import BETA, COLUMNS, NORMAL, ROTATION, SLIP, START
+from lyra_petsc.contact.pair_distances import EDGE_EDGE, VERTEX_TRIANGLE
 
 Array = NDArray[np.float64]
 
@@ -33,21 +32,19 @@ class Pairs(NamedTuple):
     slip: Array
 
     @property
-    def unpacked(self) -> tuple[Array, ...]:
-        """Tangents, w, constant and ξ, as `unpack` gives them."""
-        data = np.zeros((N, COLUMNS))
-        for at, each in ((BETA, self.beta), (NORMAL, self.normal), (START, self.start), (SLIP, self.slip)):
-            data[:, at : at + each.shape[1]] = each
-        data[:, ROTATION : ROTATION + 9] = self.rotation[:, 1:].reshape(N, 9)
-        shapes = (4,), (2, 3), (2, 4, 3), (2,), (3,), (3,)
-        arrays = [np.empty((N, *shape)) for shape in shapes]
-        friction_pairs.unpack(data, *arrays)
-        return tuple(arrays[1:5])
+    def tangents(self) -> Array:
+        """(N, 2, 3)."""
+        across = np.cross(self.normal, [0.6, 0.0, 0.8])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        return np.stack([across, np.cross(self.normal, across)], axis=1)
 
     def state(self, limit: float = 0.4) -> tuple[Array, ...]:
-        """What the kernels take."""
-        _, gradients, constant, _ = self.unpacked
-        return self.stencil, gradients, constant, np.full(N, 3.0), np.full(N, limit)
+        """The arguments of the kernels."""
+        tangents, turns = self.tangents, np.einsum("eck,eik->eci", self.tangents, self.rotation)
+        gradients = self.beta[:, None, :, None] * tangents[:, :, None, :]
+        gradients = gradients + turns[:, :, :, None] * self.normal[:, None, None, :]
+        offset = np.einsum("eck,ek->ec", tangents, self.slip - self.start)
+        return self.stencil, gradients, offset, np.full(N, 3.0), np.full(N, limit)
 
 
 @pytest.fixture
@@ -134,7 +131,7 @@ def test_forces_lie_in_the_plane_and_in_the_cone(x: Array, pairs: Pairs) -> None
 
 
 def test_sliding_leaves_what_the_limit_stretches(x: Array, pairs: Pairs) -> None:
-    state, (tangents, *_, slip) = pairs.state(), pairs.unpacked
+    state, tangents, slip = pairs.state(), pairs.tangents, pairs.slip.copy()
     before, force = energies(x, state), gradient(x, state)
     heat, slides = np.empty(N), np.empty(N, dtype=np.bool_)
     friction_pairs.return_map(x, *state, tangents, slip, heat, slides)

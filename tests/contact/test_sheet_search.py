@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distances
+from lyra_petsc.contact.pair_distances import EDGE_EDGE, VERTEX_TRIANGLE, distances
 from lyra_petsc.contact.sheet_search import SheetSearch
 
 Array = NDArray[np.float64]

@@ -154,9 +154,7 @@ def test_friction_holds_a_strip_over_a_rod_within_mu_times_the_normal_force(
     assert isinstance(term, ContactBarrier)
     torque = abs(simulation.energy_balance.obstacle_forces(1)[0, 4])
     allowed = (
-        MU
-        * RADIUS
-        * float(term.find_contacts(equations.x, equations.step.frozen[term].stage, term.n_owned)[2].sum())
+        MU * RADIUS * float(term.find_contacts(equations.x, equations.step.frozen[term].stage).force.sum())
     )
     simulation.destroy()
     assert newton < 250

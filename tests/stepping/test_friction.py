@@ -12,8 +12,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from physics import CLOTH, end_on_one_rank, finished, gathered, grid, obj_file, scene_of, shape, stepped
 
-from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 from lyra_petsc.contact.friction import CoulombFriction
+from lyra_petsc.contact.pair_distances import EDGE_EDGE, VERTEX_TRIANGLE
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -524,19 +524,25 @@ def test_a_resumed_run_keeps_sticking_contacts(comm: MPI.Comm, shared_tmp: Path,
     unbroken = gathered(simulation.problem.points, simulation.problem.equations.x)
     term = simulation.problem.terms["friction"]
     assert isinstance(term, CoulombFriction)
-    stored = term.state()["pairs"]
-    vertices, pairs = stored.vertices, stored.values
+    stored = term.state()
+    vertices, values = (
+        stored["slip"].vertices,
+        {name: stored[name].values for name in ("pair", "slip", "slides")},
+    )
     assert vertices is not None
-    between = (pairs[:, 0] == EDGE_EDGE) & (pairs[:, 1] < 0)
-    renamed, turned = vertices.copy(), pairs.copy()
+    between = (values["pair"][:, 0] == EDGE_EDGE) & (values["pair"][:, 1] < 0)
+    renamed, turned = vertices.copy(), values["slip"].copy()
     renamed[between] = vertices[between][:, [3, 2, 1, 0]]
-    turned[between, 6:9] *= -1.0
-    term.restore_pairs(renamed, turned, {})
-    again = term.state()["pairs"]
-    np.testing.assert_array_equal(again.vertices, vertices)
-    np.testing.assert_array_equal(again.values, pairs)
-    slips = comm.allgather(np.linalg.norm(pairs[:, 6:9], axis=1).max(initial=0.0))
-    kinds = set().union(*comm.allgather({(int(kind), obstacle < 0) for kind, obstacle in pairs[:, :2]}))
+    turned[between] *= -1.0
+    term.restore_pairs(renamed, values | {"slip": turned}, {})
+    again = term.state()
+    np.testing.assert_array_equal(again["slip"].vertices, vertices)
+    for name in values:
+        np.testing.assert_array_equal(again[name].values, values[name])
+    slips = comm.allgather(np.linalg.norm(values["slip"], axis=1).max(initial=0.0))
+    kinds = set().union(
+        *comm.allgather({(int(kind), obstacle < 0) for kind, obstacle in values["pair"][:, :2]})
+    )
     simulation.destroy()
     assert max(slips) > 1e-6  # without which the sheets would creep on
     assert {(EDGE_EDGE, True), (VERTEX_TRIANGLE, True)} <= kinds
@@ -587,7 +593,7 @@ def test_obstacles_in_another_order_keep_sticking_contacts(comm: MPI.Comm, share
     recorder.resume(shared_tmp / "run")
     term = resumed.problem.terms["friction"]
     assert isinstance(term, CoulombFriction)
-    assert EDGE_EDGE in set().union(*comm.allgather(set(term.state()["pairs"].values[:, 0].tolist())))
+    assert EDGE_EDGE in set().union(*comm.allgather(set(term.state()["pair"].values[:, 0].tolist())))
     while not resumed.finished:
         recorder.record(resumed.step())
     after = shape(resumed)
