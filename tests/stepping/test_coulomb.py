@@ -146,7 +146,7 @@ def test_friction_between_sheets_is_below_its_limit(
     def watched(pairs: Any, *given: Any) -> Any:
         force, sticks = coulomb(pairs, *given)
         size = np.linalg.norm(force, axis=1)
-        assert (size <= friction * pairs.normal_force * (1.0 + 1e-6)).all()
+        assert (size <= friction * pairs.pairs.force * (1.0 + 1e-6)).all()
         checked.append(int(np.count_nonzero(size)))
         return force, sticks
 
