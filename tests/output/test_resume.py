@@ -55,6 +55,16 @@ PLATE: dict[str, Any] = {
 }
 """Changes to a cantilever; its load steps are also extrapolated along tangents."""
 
+LANDING: dict[str, Any] = {
+    "mesh": grid(0.4, 0.08, 12, 2, "alternating") | {"transform": {"translate": [0, 0, 0.05]}},
+    "material": CLOTH | {"bending": 1e-3, "density": 1.0},
+    "handles": [{"box": [[-1, -1, -1], [0.05, 1, 1]]}],
+    "contact": {"friction": 0.3, "gap": 2e-3, "self": False},
+    "obstacles": {"floor": {"plane": {"point": [0, 0, 0], "normal": [0, 0, 1]}}},
+    "probes": {"corner": {"nodes": [24, 29]}},
+}
+"""Changes to a strip that lands on a floor with friction."""
+
 LENGTHS: dict[str, dict[str, Any]] = {"fixed": {"step": 0.004}, "auto": {"step": "auto", "tolerance": 2e-2}}
 """Kinds of steps."""
 
@@ -65,6 +75,7 @@ KINDS = [
     ),
     "static",
     "static, directors",
+    "static, friction",
 ]
 """All combinations of integrator, bending model, contact and kind of steps; and static analyses."""
 
@@ -74,7 +85,7 @@ def scene_with(kind: str, end: float = 0.1) -> dict[str, Any]:
         scene = SCENE | {"time": {"analysis": "static", "step": 0.1}} | (PLATE if "directors" in kind else {})
         del scene["wind"]  # which turns with the sheet, and takes ten times as long to balance
         del scene["loads"]
-        return scene
+        return scene | (LANDING if "friction" in kind else {})
     integrator, bending, contact, length = kind.split(", ")
     scene = SCENE | {"time": {"end": end, "integrator": integrator} | LENGTHS[length]}
     scene["material"] = scene["material"] | {"bending_model": bending}

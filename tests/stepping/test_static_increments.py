@@ -93,6 +93,27 @@ def test_default_increments_lead_to_the_energy_of_100(
     assert energy == pytest.approx(fine, rel=1e-2)
 
 
+@pytest.mark.parallel(2)
+def test_friction_of_each_contact_is_at_most_mu_times_its_normal_force(comm: MPI.Comm) -> None:
+    """On a plane each vertex has one contact; those of a plate that lands slide."""
+    scene = SCENES["plate on a plane, hinges"]()
+    simulation = SteppedScene(comm, scene_of(scene))
+    while not simulation.finished:
+        simulation.step()
+    equations, terms = simulation.problem.equations, simulation.problem.terms
+    equations.begin_step(simulation.time, simulation.time + 1e-9)  # with the normal forces in the equilibrium
+    normal, friction = (
+        equations.forces.sum([terms[name]], equations.x, equations.step.frozen)
+        for name in ("contact", "friction")
+    )
+    allowed, used = scene["contact"]["friction"] * -normal[:, 2], np.linalg.norm(friction, axis=1)
+    touching, sliding = comm.allreduce(np.array([np.sum(allowed > 0.0), np.sum(used > 0.999 * allowed)]))
+    simulation.destroy()
+    assert touching > 3
+    assert (used <= allowed * (1.0 + 1e-5)).all()
+    assert sliding > 0
+
+
 @pytest.mark.parametrize("more", [{"snes_rtol": "1e-4"}, {"ksp_type": "gmres"}, {"snes_max_it": "12"}])
 def test_options_that_change_the_iterations_do_not_change_the_shape(
     more: dict[str, str], options: dict[str, str]
