@@ -9,8 +9,8 @@ during a solve with their own stiffness. Friction takes the normal forces of the
 `friction_balance` tells.
 
 A snap takes many solves in which the out-of-balance force grows, while the potential energy falls. If a solve
-in contact runs out of iterations, the next one starts from its iterate of least energy. With friction neither
-counts: solves whose friction lags behind normal forces may let sheets slide off.
+in contact without friction runs out of iterations, the next one starts from its iterate of least energy; not
+with friction, as solves whose friction lags behind normal forces may let sheets slide off.
 
 Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
 """
@@ -192,7 +192,7 @@ class Equilibrium:
                 self._integrator.alternatives = self._prediction.along_tangent(before, factor)
                 frozen = equations.step.frozen
             progress.record_force(force, attempt.linear_iterations if progress.solves else None)
-            if progress.solves and judges_energy and not limits.has_friction_pairs(equations):
+            if progress.solves and judges_energy:
                 progress.record_potential(self._potential_energy(x))
             balanced = progress.solved_once and self._balance.is_zero(force, progress.last_force)
             settled = friction.is_rough or (balanced and friction.is_settled())

@@ -204,12 +204,12 @@ class FrictionBalance:
         sums = self._equations.active.friction_lag(self._equations.x, self._equations.step.frozen)
         if not sums:
             return 0.0, ""
-        each = self._equations.points.global_sum(*np.concatenate(list(sums.values()))).reshape(-1, 3)
+        by_partner = self._equations.points.global_sum(*np.concatenate(list(sums.values()))).reshape(-1, 3)
         slides = [
             f"it slides on {name}" if name else "sheets slide on each other"
-            for name, (_, friction, allowed) in zip(sums, each, strict=True)
+            for name, (_, friction, allowed) in zip(sums, by_partner, strict=True)
             if friction > SLIDES * allowed > 0.0
         ]
-        wrong, friction, allowed = each.sum(axis=0)
+        wrong, friction, allowed = by_partner.sum(axis=0)
         message = f"{' and '.join(slides)}, with {friction:.3g} N of friction" if slides else ""
         return float(wrong / max(allowed, np.finfo(float).tiny)), message
