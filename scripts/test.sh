@@ -4,9 +4,9 @@
 #   bash scripts/test.sh [--quick] [pytest arguments]
 #
 # First all tests, in two processes a core (at most four), as many tests wait for other programs; then those marked
-# `parallel`, under mpirun on two and on three ranks. With --quick only tests marked `quick` run, on one and two
-# ranks: some of each kind, within a minute. With -s, -n 0 or the name of a file all tests run in one process.
-# The last line is pytest's closing line of the first part, the exit code that of the first failure.
+# `parallel`, under mpirun on two and on three ranks. With --quick only tests marked `quick` run, some of each kind,
+# within a minute: those marked `parallel` on two ranks, the others on one. With -s, -n 0 or the name of a file all
+# tests run in one process. The last line is pytest's closing line of the first part, the exit code that of the first failure.
 set -euo pipefail
 
 source "$(dirname -- "${BASH_SOURCE[0]}")/environment.sh"
@@ -71,10 +71,11 @@ code=0
 parts=()
 # run_part RANKS: runs the tests of this number of ranks, shows pytest's output and keeps it
 run_part() {
-    local ranks=$1 result=0 file files selection wanted=("${kinds[@]}")
+    local ranks=$1 result=0 file files selection wanted=("${kinds[@]}") alone=()
     local command=("${python[@]}" -m pytest --color="$color")
     if ((ranks == 1)); then
         command+=(-n auto --dist worksteal)
+        ((${#kinds[@]} == 0)) || alone=("not parallel")
     else
         command=("${limit[@]}" "${launcher[@]}" -n "$ranks" sh -c "$one_rank" sh "${command[@]}")
         wanted+=(parallel)
@@ -83,7 +84,7 @@ run_part() {
     ((ranks == 1 || ${#files[@]})) || return 0
     ((${#paths[@]} == 0)) || files=("${paths[@]}")
     parts=("$ranks" "${parts[@]}")
-    selection=$(printf ' and %s' "${wanted[@]}" "${marks[@]}")
+    selection=$(printf ' and %s' "${wanted[@]}" "${alone[@]}" "${marks[@]}")
     say "tests on $ranks rank(s)"
     # tee must survive an interrupt, to show pytest's output about it
     "${command[@]}" "${files[@]}" "${arguments[@]}" -m "${selection# and }" 2>&1 |

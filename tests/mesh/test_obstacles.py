@@ -17,7 +17,7 @@ from lyra_petsc.scene.load import scene_of
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.handles.motion import Motion
 
-pytestmark = [pytest.mark.parallel, pytest.mark.quick]
+pytestmark = [pytest.mark.parallel(2), pytest.mark.quick]
 
 ROLL = [
     {"time": 0.5, "translate": [1, 0, 0], "rotate": {"axis": [0, 0, 1], "degrees": 30}},

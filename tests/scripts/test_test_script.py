@@ -84,7 +84,7 @@ def test_all_tests_on_one_rank_and_the_parallel_ones_on_two_and_three(tests: Tes
 
 def test_quick_collects_only_files_with_quick_tests(tests: Tests) -> None:
     done = tests("--quick", "-m", "not slow")
-    assert "'-m', 'quick and (not slow)'" in first_part(done)
+    assert "'-m', 'quick and not parallel and (not slow)'" in first_part(done)
     assert "quick and parallel and (not slow)" in parallel_part(done, 2)
     mark = "pytest.mark." + "quick"  # not in one word, or this file would have it
     for words in (first_part(done), parallel_part(done, 2)):
