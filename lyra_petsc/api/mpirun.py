@@ -18,15 +18,6 @@ from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.file_operations import reason
 from lyra_petsc.startup import is_launched
 
-POLL = 0.05
-"""Seconds between checks whether a process has ended."""
-
-GRACE = 10.0
-"""Seconds after the request to end before a process is killed."""
-
-PR_SET_PDEATHSIG = 1
-"""Number of the Linux prctl that sets the signal a process gets when its parent ends."""
-
 JOB_PREFIXES = ("OMPI_COMM_", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PMI_", "HYDRA_", "ORTE_SCHIZO_")
 
 SINGLETON_VARIABLES = frozenset(
@@ -110,7 +101,7 @@ def run_launched(
             raise OutputError(f"{command[0]} cannot be started: {reason(error)}") from error
         try:
             while process.poll() is None:
-                time.sleep(POLL)
+                time.sleep(0.05)
                 watch()
             watch()
         except BaseException:
@@ -126,13 +117,14 @@ def _end_with_parent() -> Callable[[], None] | None:
         control = ctypes.CDLL(None).prctl
     except (AttributeError, OSError):
         return None
-    return lambda: control(PR_SET_PDEATHSIG, signal.SIGTERM)
+    set_signal = 1  # PR_SET_PDEATHSIG: the signal that a process gets when its parent ends
+    return lambda: control(set_signal, signal.SIGTERM)
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> None:
     process.terminate()
     try:
-        process.wait(GRACE)
+        process.wait(10.0)  # seconds, before it is killed
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()

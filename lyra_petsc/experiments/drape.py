@@ -16,11 +16,11 @@ from lyra_petsc.experiments.fabric.specimens import G
 
 Picture = Mask
 
-CLOTH, DISC, DRAPE_GAP = 0.15, 0.09, 2e-3
-"""Radii of cloth and disc, and contact gap [m]"""
+CLOTH, DISC = 0.15, 0.09
+"""Radii of cloth and disc [m]"""
 
-STARTS, NOISE = 5, 2e-4
-"""Number of start shapes, and standard deviation [m] of their random heights"""
+STARTS = 5
+"""Number of start shapes"""
 
 STEP, STEPS = 0.04, 40
 """Δt [s] and number of steps; backward Euler with these long steps damps the motion."""
@@ -44,7 +44,7 @@ def drape_scene(
     rest: Array,
     material: dict[str, Any],
     seed: int,
-    gap: float = DRAPE_GAP,
+    gap: float = 2e-3,
     iterations: int = 50,
 ) -> dict[str, Any]:
     """The scene of a cloth that falls over the disc; collective.
@@ -72,7 +72,7 @@ def drape_scene(
         "material": material,
         "time": {"end": STEP * STEPS, "step": STEP},
         "gravity": [0.0, 0.0, -G],
-        "initial": {"noise": NOISE, "seed": seed},
+        "initial": {"noise": 2e-4, "seed": seed},
         "contact": {"gap": gap, "friction": 0.3, "self": False},
         "obstacles": {"disc": disc},
         "solver": {"force_tolerance": 1e-5, "step_tolerance": 1e-5, "max_iterations": iterations},

@@ -16,9 +16,6 @@ from lyra_petsc.experiments.results import View, align_columns
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, short
 from lyra_petsc.show.report.plots import colour, empty_figure, make_drawing, surface
 
-MAX_ROWS = 60
-"""Largest number of measurements in the table of the page; fit.json has all."""
-
 
 @dataclass
 class FitOutcome(Outcome[Case]):
@@ -113,7 +110,6 @@ class FitView(View[FitOutcome]):
         report.heading("Before and after")
         if plots:
             report.figure(_residuals(fitted))
-            report.figure(_costs(fitted))
             if fitted.triangles is not None:
                 for shape, name in zip(fitted.shapes, ("before", "after"), strict=True):
                     if shape is not None:
@@ -124,7 +120,8 @@ class FitView(View[FitOutcome]):
         report.heading("Measurements")
         keys = [unknown.key for unknown in fitted.unknowns]
         times = [reading.time for reading in fitted.readings for _ in reading.parts]
-        shown = list(range(len(fitted.labels)))[:MAX_ROWS]
+        largest = 60  # rows of the page; fit.json has all
+        shown = list(range(len(fitted.labels)))[:largest]
         report.table(
             ["measurement", "time", "measured", "uncertainty", "before", "after", *keys],
             [
@@ -134,16 +131,7 @@ class FitView(View[FitOutcome]):
                 for i in shown
             ],
             caption="Last columns: by how many uncertainties the value changes with the whole parameter."
-            + (f" {MAX_ROWS} of {len(fitted.labels)}; fit.json has all." * (len(shown) < len(times))),
-        )
-        report.heading("What the data tell")
-        report.table(
-            ["standard deviation", *keys],
-            [
-                [f"{100.0 / value:.3g} %" if value > 0.0 else "unknown", *map(float, direction)]
-                for value, direction in zip(conclusion.singular_values, conclusion.directions, strict=True)
-            ],
-            caption="Combinations of parameters, in units of their sizes, from the best known to the least.",
+            + (f" {largest} of {len(fitted.labels)}; fit.json has all." * (len(shown) < len(times))),
         )
         report.paragraph(
             f"{len(fitted.evaluations)} evaluations, {fitted.runs} simulations, {fitted.seconds:.1f} s."
@@ -170,12 +158,3 @@ def _residuals(fitted: Fitted) -> Drawing:
     return make_drawing(
         figure, f"{PLOTS}/residuals", "How far the scene is from each measurement, before and after the fit."
     )
-
-
-def _costs(fitted: Fitted) -> Drawing:
-    figure = empty_figure(2.8)
-    axes = figure.add_subplot(xlabel="evaluation", ylabel="sum of squares", yscale="log")
-    costs = [max(2.0 * evaluation.cost, 1e-300) for evaluation in fitted.evaluations]
-    axes.plot(range(1, len(costs) + 1), costs, color=colour(0), marker="o", ms=4)
-    axes.grid(True, color="#dfe3e8", lw=0.8)
-    return make_drawing(figure, f"{PLOTS}/search", "Sum of squares over the evaluations.")

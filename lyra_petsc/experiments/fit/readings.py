@@ -25,7 +25,6 @@ from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.problem import Problem
 
 AXES = ("x", "y", "z")
-MAX_ROWS = 100_000
 
 SAME_TIME = 1e-9
 """Fraction of the end time by which the time of a step may differ from that of a measurement."""
@@ -296,8 +295,9 @@ class _Table:
         kept = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
         if len(kept) < 2:
             raise InputError("must hold a line with the names of columns, and lines of numbers", file=path)
-        if len(kept) - 1 > MAX_ROWS:
-            raise InputError(f"holds {len(kept) - 1} lines; thin it out to at most {MAX_ROWS}", file=path)
+        largest = 100_000
+        if len(kept) - 1 > largest:
+            raise InputError(f"holds {len(kept) - 1} lines; thin it out to at most {largest}", file=path)
         heading = kept[0][1]
         sign = next((sign for sign in ";\t" if sign in heading), ",")
         try:  # each line by itself: quotes do not reach beyond it

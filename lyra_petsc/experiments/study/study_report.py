@@ -33,7 +33,7 @@ from lyra_petsc.experiments.study.study_runner import SAFETY, Reference, StudyRo
 from lyra_petsc.extras import PACKAGES
 from lyra_petsc.output.summary import library_versions
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
-from lyra_petsc.show.report.plots import Series, convergence, fitted_slope, work_precision
+from lyra_petsc.show.report.plots import Series, convergence, work_precision
 
 
 def spacing(row: StudyRow, axis: Axis) -> float:
@@ -64,42 +64,16 @@ def shared_label(row: StudyRow, axis: Axis | None) -> str:
     return ", ".join(filter(None, [row.integrator, describe_settings(rest)]))
 
 
-@dataclass(frozen=True)
-class Order:
-    """Observed order of convergence of one family of rows.
-
-    Attributes
-    ----------
-    axis, quantity, family : str
-    fitted : float
-        Least-squares slope over all resolved rows.
-    neighbours : tuple of float
-        Between neighbours, coarsest first.
-    """
-
-    axis: str
-    quantity: str
-    family: str
-    fitted: float
-    neighbours: tuple[float, ...]
-
-
-def observed_orders(rows: Sequence[StudyRow], axes: Sequence[Axis], quantities: Sequence[str]) -> list[Order]:
-    """Observed orders along every numeric axis; orders between neighbours are also stored in the rows."""
-    orders = []
+def mark_orders(rows: Sequence[StudyRow], axes: Sequence[Axis], quantities: Sequence[str]) -> None:
+    """Store in each row the observed orders from the next coarser row along every numeric axis."""
     for axis, name in itertools.product((axis for axis in axes if axis.refines), quantities):
-        for label, group in families(rows, axis).items():
-            known = [row for row in group if row.resolved(name) > 0.0]
-            sizes = [spacing(row, axis) for row in known]
-            errors = [row.resolved(name) for row in known]
-            for k, row in enumerate(known[1:], 1):
-                if sizes[k - 1] > sizes[k] > 0.0:
-                    ratio = sizes[k - 1] / sizes[k]
-                    row.orders[axis.key, name] = math.log(errors[k - 1] / errors[k]) / math.log(ratio)
-            if len(known) >= 2:
-                between = tuple(row.orders.get((axis.key, name), math.nan) for row in known[1:])
-                orders.append(Order(axis.key, name, label, fitted_slope(sizes, errors), between))
-    return orders
+        for group in families(rows, axis).values():
+            known = [
+                (spacing(row, axis), row.resolved(name), row) for row in group if row.resolved(name) > 0.0
+            ]
+            for (h, error, _), (finer, smaller, row) in itertools.pairwise(known):
+                if h > finer > 0.0:
+                    row.orders[axis.key, name] = math.log(error / smaller) / math.log(h / finer)
 
 
 def mark_front(rows: Sequence[StudyRow], quantity: str) -> None:
@@ -480,7 +454,6 @@ class StudyView(View[Outcome[Any]]):
     Attributes
     ----------
     runner : StudyRunner
-    orders : list of Order
     advice : dict of physics → list of Advice
     """
 
@@ -490,7 +463,6 @@ class StudyView(View[Outcome[Any]]):
     def __init__(self, runner: StudyRunner) -> None:
         self.runner, self.plan = runner, runner.plan
         self.title = f"Error against run time: {self.plan.base.title or self.plan.request.scene}"
-        self.orders: list[Order] = []
         self.advice: dict[Physics, list[Advice]] = {}
 
     @property
@@ -503,7 +475,7 @@ class StudyView(View[Outcome[Any]]):
         yield from self.runner.cases()
         plan, runner = self.plan, self.runner
         names = [quantity.name for quantity in plan.quantities]
-        self.orders = observed_orders(runner.rows, plan.axes, names)
+        mark_orders(runner.rows, plan.axes, names)
         for physics in runner.references:
             mark_front(runner.rows_of(physics), names[0])
             self.advice[physics] = advise(runner.rows_of(physics), names)
@@ -522,7 +494,7 @@ class StudyView(View[Outcome[Any]]):
         return "" if value is None else str(value)
 
     def content(self, outcomes: Sequence[Outcome[Any]], ranks: int, command: Sequence[str]) -> dict[str, Any]:
-        """Content of the JSON file: the table with all repeats, references, orders and advice."""
+        """Content of the JSON file: the table with all repeats, references and advice."""
         plan = self.plan
         return {
             "scene": plan.request.scene,
@@ -551,7 +523,6 @@ class StudyView(View[Outcome[Any]]):
                 csv_row(plan, row) | {"timings": [asdict(timing) for timing in row.result.timings]}
                 for row in self.runner.rows
             ],
-            "orders": [asdict(order) for order in self.orders],
             "advice": [
                 {
                     "scene": dict(physics),
@@ -580,21 +551,6 @@ class StudyView(View[Outcome[Any]]):
                 report.figure(drawing)
         report.heading("Errors and run times")
         _write_tables(report, plan, rows)
-        if self.orders:
-            report.heading("Observed orders")
-            report.table(
-                ["along", "quantity", "line", "fitted", "between neighbours"],
-                [
-                    [
-                        o.axis,
-                        o.quantity,
-                        o.family,
-                        f"{o.fitted:.2f}",
-                        ", ".join(f"{v:.2f}" for v in o.neighbours),
-                    ]
-                    for o in self.orders
-                ],
-            )
         _write_references(report, references)
         failed = [[row.case.title, row.result.problem] for row in rows if not row.passed]
         if failed:

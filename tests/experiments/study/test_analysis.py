@@ -13,7 +13,7 @@ from lyra_petsc.experiments.study.study_report import (
     advise,
     choose_recommended,
     mark_front,
-    observed_orders,
+    mark_orders,
 )
 from lyra_petsc.experiments.study.study_runner import (
     Chain,
@@ -48,23 +48,21 @@ def made_up(own_errors: float = 0.0) -> list[StudyRow]:
     return rows
 
 
-def test_orders_between_neighbours_and_fitted() -> None:
+def test_orders_between_neighbours() -> None:
     rows = made_up()
-    orders = observed_orders(rows, AXES, ["position_max"])
-    assert [(o.axis, o.family) for o in orders] == [("dt", "beuler"), ("dt", "bdf2")]
-    assert orders[0].fitted == pytest.approx(1.0)
-    assert orders[1].neighbours == pytest.approx((2.0, 2.0))
+    mark_orders(rows, AXES, ["position_max"])
     assert ("dt", "position_max") not in rows[0].orders
+    assert rows[2].orders["dt", "position_max"] == pytest.approx(1.0)
     assert rows[5].orders["dt", "position_max"] == pytest.approx(2.0)
 
 
 def test_orders_use_the_mean_length_of_the_steps_taken() -> None:
     rows = made_up()
-    for row in rows:  # as if all steps had been cut to half
+    for row in rows:  # as if the longest steps had been cut to half
         row.result.steps *= 2 if row.case.settings["dt"] == 0.04 else 1
-    orders = observed_orders(rows[:3], AXES, ["position_max"])
-    assert math.isnan(orders[0].neighbours[0])  # both took the same steps
-    assert orders[0].neighbours[1] == pytest.approx(1.0)
+    mark_orders(rows[:3], AXES, ["position_max"])
+    assert not rows[1].orders  # both took the same steps
+    assert rows[2].orders["dt", "position_max"] == pytest.approx(1.0)
 
 
 def test_the_pareto_front() -> None:
@@ -96,8 +94,9 @@ def test_errors_below_that_of_the_reference_are_not_resolved() -> None:
     assert rows[4].unresolved == set()
     assert rows[4].error_bound("position_max") == pytest.approx(0.0115)
     assert rows[5].error_bound("position_max") == pytest.approx(0.0045)
-    orders = observed_orders(rows, AXES, ["position_max"])
-    assert len(orders[1].neighbours) == 1
+    mark_orders(rows, AXES, ["position_max"])
+    assert rows[4].orders
+    assert not rows[5].orders
     mark_front(rows, "position_max")
     assert rows[5].on_front  # it is more accurate than all others, however much
     words = advise(rows, ["position_max"])[1].text

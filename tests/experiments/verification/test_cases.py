@@ -38,7 +38,7 @@ FEWER: dict[str, dict[str, object]] = {
     "plate-vibration": {"KINDS": ("criss-cross", "gmsh")},
     "hinged-roof": {"PATTERNS": ("alternating",)},
     "incline": {"SLOPES": (5.0, 60.0)},
-    "capstan": {"WRAPS": ((0.5, 0.1), (1.0, 0.3), (1.5, 0.5))},
+    "capstan": {"WRAPS": {0.5: (0.1,), 1.0: (0.3,), 1.5: (0.5,)}},
     "sheets": {"SLIDERS": ("bdf2",)},
     "cusick": {"MESHES": ("irregular",), "STARTS": 2},
 }  # fmt: skip

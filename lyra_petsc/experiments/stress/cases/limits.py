@@ -46,14 +46,12 @@ LINKS, SPAN, RISE, DENSITY = 10, 0.7, 0.25, 0.15
 JOINT_MASS = 0.5 * DENSITY * WIDTH * LENGTH / LINKS
 """Mass of a vertex [kg]."""
 
-STEP, STEPS = 0.005, 40
-
 
 def strip(setting: Setting, bench: Bench, stiffness: float) -> Content:
     return hung(bench, LINKS, 1.0, SPAN, RISE) | {
         "title": "A strip between two supports",
         "material": {"density": DENSITY, "membrane": isotropic(stiffness)},
-        "time": {"end": STEPS * STEP, "step": STEP},
+        "time": {"end": 1.0, "step": setting.step},
     }
 
 
@@ -97,13 +95,13 @@ def as_inextensible_chain(
     x, v = np.asarray(record.observed[0]), np.zeros((LINKS + 1, 2))
     off = 0.0
     for observed_x in record.observed[1:]:
-        x, v = step_inextensible_chain(x, v, STEP, LENGTH / LINKS)
+        x, v = step_inextensible_chain(x, v, record.nominal, LENGTH / LINKS)
         off = max(off, float(np.linalg.norm(observed_x - x, axis=1).max()))
     # allowed deviation over weight/C times the length
     allowed = 2.0 * DENSITY * G * LENGTH / stiffness * LENGTH
     # the residual of a step acts as an impulse, which moves the joints in all following steps
-    displacements = [b.residual * (STEPS - k) for k, b in enumerate(record.balances)]
-    unsolved = sum(displacements) * STEP**2 / JOINT_MASS
+    displacements = [b.residual * (record.planned - k) for k, b in enumerate(record.balances)]
+    unsolved = sum(displacements) * record.nominal**2 / JOINT_MASS
     message = (
         f"{off:.2e} m from the inextensible chain, {allowed:.2e} m allowed for its stretch "
         f"and {unsolved:.2e} m for what was left unsolved"
@@ -111,18 +109,11 @@ def as_inextensible_chain(
     return {"stiff limit": Verdict(off <= allowed + unsolved, message)}
 
 
-SIDE, GRAVITY, AREAL, CELLS = 1.0, 9.8, 0.15, 16
-"""Side [m], gravity [m/s²], density [kg/m²], cells along a side"""
-
-FALL_TIME = 1.8540746773013719 * math.sqrt(2.0 * SIDE / (3.0 * GRAVITY))
-"""Time [s] at which the rigid plate passes the vertical"""
-
-
 def plate(setting: Setting, bench: Bench, stiffness: float, bending: float) -> Content:
-    mesh = grid(SIDE, SIDE, CELLS, CELLS, "alternating")
-    material = {"density": AREAL, "membrane": isotropic(stiffness, 0.3), "bending": bending}
+    mesh = grid(1.0, 1.0, 16, 16, "alternating")
+    material = {"density": DENSITY, "membrane": isotropic(stiffness, 0.3), "bending": bending}
     time, about = {"end": 0.5, "step": setting.step}, "A plate hinged at one edge"
-    return scene(mesh, material, time, title=about, gravity=[0.0, 0.0, -GRAVITY], handles=[{"group": "left"}])
+    return scene(mesh, material, time, title=about, gravity=[0.0, 0.0, -9.8], handles=[{"group": "left"}])
 
 
 def centre(trial: Trial) -> tuple[float, float]:
@@ -143,17 +134,16 @@ def first_vertical(times: list[float], centres: list[tuple[float, float]]) -> fl
 
 
 def as_rigid_plate(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
+    # time [s] at which the rigid plate of 1 m passes the vertical
+    exact = 1.8540746773013719 * math.sqrt(2.0 / (3.0 * 9.8))
     # allowed relative error, and part of Δt by which backward Euler may be early in addition
     late, early = 0.005, 0.25
     centres = cast("list[tuple[float, float]]", record.observed)
     passed = first_vertical([0.0, *record.times], centres)
-    earliest, latest = FALL_TIME * (1.0 - late) - early * record.nominal, FALL_TIME * (1.0 + late)
+    earliest, latest = exact * (1.0 - late) - early * record.nominal, exact * (1.0 + late)
     message = f"first vertical at {passed:.4f} s, from {earliest:.4f} to {latest:.4f} s allowed"
     return {"rigid plate": Verdict(earliest <= passed <= latest, message)}
 
-
-PAPER_END = 0.48
-"""End time [s]"""
 
 SOFTER, FINER, SECOND_ORDER = 1e-3, 4, "bdf2"
 """Factor on the stiffness of the soft sheet; refinement of Δt and integrator of its converged value."""
@@ -176,7 +166,7 @@ def kinetic(trial: Trial) -> float:
 def _soft_kinetic(setting: Setting, bench: Bench, integrator: str, step: float) -> float:
     """Kinetic energy [J] of the soft sheet at the end."""
     content = scale(paper(setting, bench, integrator), stretching=SOFTER)
-    content["time"] |= {"step": step, "end": PAPER_END}
+    content["time"] |= {"step": step, "end": 0.48}
     with bench.simulation(content) as trial:
         return kinetic(trial.run())
 

@@ -152,8 +152,8 @@ def rest(bench: Bench, n: float) -> Iterator[Measured]:
 # -- belt over a cylinder --------------------------------------------------------------------------------
 
 
-WRAPS = ((0.5, 0.1), (0.5, 0.5), (1.0, 0.3), (1.5, 0.1), (1.5, 0.5))
-"""Angle of wrap over π, and μ"""
+WRAPS = {0.5: (0.1, 0.5), 1.0: (0.3,), 1.5: (0.1, 0.5)}
+"""μ by the angle of wrap over π"""
 
 
 def _belt(bench: Bench, angle: float, friction: float, n: int) -> tuple[dict[str, Any], list[list[int]]]:
@@ -206,7 +206,7 @@ def _belt(bench: Bench, angle: float, friction: float, n: int) -> tuple[dict[str
 
 
 def capstan(bench: Bench, n: float) -> Iterator[Measured]:
-    for turns, friction in WRAPS:
+    for turns, friction in ((turns, friction) for turns, values in WRAPS.items() for friction in values):
         content, ends = _belt(bench, math.pi * turns, friction, round(n))
         with bench.simulation(content) as trial:
             pull = trial.gather(trial.run().simulation.energy_balance.reaction)[:, ::2]

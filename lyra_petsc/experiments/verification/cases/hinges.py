@@ -185,25 +185,24 @@ def hinge_strip(bench: Bench, n: float) -> Iterator[Measured]:
             yield Measured(f"B_effective / B, {pattern}, {label}", value, expected(pattern, ratio))
 
 
-CELLS = 8
-"""Along each side of the meshes."""
-
-
 def _lattice(mesh: str) -> Array:
     """Edge vectors [m] of the primitive cell, as columns."""
     return np.array([[1.0, -0.5], [0.0, np.sqrt(0.75)]]) if mesh == "equilateral" else np.eye(2)
 
 
-def _equilateral(bench: Bench) -> dict[str, Any]:
+def _equilateral(bench: Bench, cells: int) -> dict[str, Any]:
     """A rhombus of equilateral triangles with edges of 1 m."""
-    vertices, triangles = rectangle(CELLS, CELLS, CELLS, CELLS, alternating=False)
+    vertices, triangles = rectangle(cells, cells, cells, cells, alternating=False)
     vertices[:, :2] = vertices[:, :2] @ _lattice("equilateral").T
     return bench.mesh(vertices, triangles)
 
 
 def hinge_sheet(bench: Bench, n: float) -> Iterator[Measured]:
     for mesh, rows in load_data("hinge_sheet")["D_over_k"].items():
-        block = _equilateral(bench) if mesh == "equilateral" else grid(CELLS, CELLS, CELLS, CELLS, mesh)
+        cells = 8  # along each side
+        block = (
+            _equilateral(bench, cells) if mesh == "equilateral" else grid(cells, cells, cells, cells, mesh)
+        )
         with bench.simulation(_plate(block)) as trial:
             hinges, points = hinges_of(trial), trial.x[:, :2]
         # k = B/6

@@ -242,32 +242,26 @@ def _followed(bench: Bench, n: float, integrator: str) -> tuple[float, NDArray[n
 
 # -- a hanging one ---------------------------------------------------------------------------------------
 
-LENGTH, WIDTH, DENSITY = 1.0, 0.05, 0.2
-"""Length [m], width [m], density [kg/m²]"""
-
-STIFF = 1e6
-"""Membrane stiffness [N/m]; the weight stretches the strip by 1e-6"""
-
 
 def hanging_chain(bench: Bench, n: float) -> Iterator[Measured]:
+    # length [m], density [kg/m²], membrane stiffness [N/m], which the weight stretches by 1e-6
+    length, density, stiffness = 1.0, 0.2, 1e6
+    # heights at which each bar between two rows carries the weight below its middle
+    tension = density * G * length * (np.arange(int(n)) + 0.5) / n
+    heights = np.append(0.0, np.cumsum(stretches(tension, 1.0 / stiffness)) * length / n)
     # under uniaxial tension neighbouring columns of vertices are not coupled: only the middle one of three is
     # free, whose masses are those of a wide sheet
     kept = {"sheet": "x", "left": "z", "right": "z"}
     held = [{"group": "top"}, *({"group": name, "axes": [axis]} for name, axis in kept.items())]
-    mesh, material = grid(WIDTH, LENGTH, 2, int(n)), {"density": DENSITY, "membrane": isotropic(STIFF)}
+    mesh, material = grid(0.05, length, 2, int(n)), {"density": density, "membrane": isotropic(stiffness)}
     with bench.simulation(scene(mesh, material, ASSEMBLED, gravity=[0, -G, 0], handles=held)) as trial:
-        x = trial.start
-        trial.set_state(x=np.column_stack([x[:, 0], _hanging(x[:, 1], n), x[:, 2]]))
+        x = trial.start.copy()
+        row = np.rint(x[:, 1] / length * n).astype(np.int64)
+        x[:, 1] = length - (heights[-1] - heights)[row]
+        trial.set_state(x=x)
         omegas, _ = lowest_modes(trial, 3)
     from scipy.special import jn_zeros
 
-    zeros = 0.5 * jn_zeros(0, len(omegas)) * math.sqrt(G / LENGTH)
+    zeros = 0.5 * jn_zeros(0, len(omegas)) * math.sqrt(G / length)
     for k, (omega, exact) in enumerate(zip(omegas, zeros, strict=True), 1):
         yield Measured(f"ω of mode {k}", float(omega), float(exact), "rad/s")
-
-
-def _hanging(y: Array, n: float) -> Array:
-    """Heights at which each bar between two rows carries the weight below its middle."""
-    tension = DENSITY * G * LENGTH * (np.arange(int(n)) + 0.5) / n
-    heights = np.concatenate([[0.0], np.cumsum(stretches(tension, 1.0 / STIFF)) * LENGTH / n])
-    return np.asarray(LENGTH - (heights[-1] - heights)[np.rint(y / LENGTH * n).astype(np.int64)])

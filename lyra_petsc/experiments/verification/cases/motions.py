@@ -45,12 +45,6 @@ def free_fall(bench: Bench, n: float) -> Sequence[Measured]:
 DENSITY, AIR = 0.2, 1.0
 """Densities of sheet [kg/m²] and air [kg/m³]"""
 
-DRAG = 2.0
-"""Tangential drag coefficient [kg/(m² s)]"""
-
-END = 0.5
-"""End time [s]"""
-
 
 def level_fall(n: float, end: float) -> tuple[float, float]:
     """Speed [m/s] and depth [m] after backward Euler steps of 1/n s; v solves a quadratic equation."""
@@ -64,27 +58,30 @@ def level_fall(n: float, end: float) -> tuple[float, float]:
 
 
 def wind_drag(bench: Bench, n: float) -> Iterator[Measured]:
+    # end [s], tangential drag coefficient [kg/(m² s)]
+    end, tangential = 0.5, 2.0
+
     def scene(gravity: list[float], air: float, drag: float) -> dict[str, Any]:
         wind = {"velocity": [0, 0, 0], "density": air, "drag": drag}
-        return _sheet(4, n, END, DENSITY, gravity=gravity, wind=wind)
+        return _sheet(4, n, end, DENSITY, gravity=gravity, wind=wind)
 
-    speed, depth = level_fall(n, END)
+    speed, depth = level_fall(n, end)
     with bench.simulation(scene([0, 0, -G], AIR, 0.0)) as trial:
         start = trial.x[0, 2]
         trial.run()
         level = worst_value(-trial.v[:, 2], speed)
         fallen = float(start - trial.x[0, 2])
     terminal = math.sqrt(DENSITY * G / AIR)
-    exact = terminal**2 / G * math.log(math.cosh(G * END / terminal))
+    exact = terminal**2 / G * math.log(math.cosh(G * end / terminal))
     yield Measured("speed of a level sheet, backward Euler", level, speed, "m/s")
     yield Measured("depth of a level sheet, backward Euler", fallen, depth, "m")
     yield Measured("depth of a level sheet, exact in time", fallen, exact, "m")
-    terminal = DENSITY * G / DRAG
-    with bench.simulation(scene([0, -G, 0], AIR, DRAG)) as trial:
+    terminal = DENSITY * G / tangential
+    with bench.simulation(scene([0, -G, 0], AIR, tangential)) as trial:
         # each step divides the difference from the terminal speed by 1 + Δt drag/density
-        slow = terminal * (1.0 - (1.0 + DRAG / DENSITY / n) ** -round(END * n))
+        slow = terminal * (1.0 - (1.0 + tangential / DENSITY / n) ** -round(end * n))
         edge_on = worst_value(-trial.run().v[:, 1], slow)
-    exact = terminal * (1.0 - math.exp(-G * END / terminal))
+    exact = terminal * (1.0 - math.exp(-G * end / terminal))
     yield Measured("speed of a sheet edge-on, backward Euler", edge_on, slow, "m/s")
     yield Measured("speed of a sheet edge-on, exact in time", edge_on, exact, "m/s")
 

@@ -10,7 +10,7 @@ import numpy as np
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import walls
 from lyra_petsc.experiments.verification.cases.cantilevers import critical
-from lyra_petsc.experiments.verification.flat_plates import lowest_squares, plate_material
+from lyra_petsc.experiments.verification.flat_plates import MEMBRANE, lowest_squares, plate_material
 from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     STATIC,
@@ -19,8 +19,6 @@ from lyra_petsc.experiments.verification.verification_case import (
 )
 
 PATTERNS = ("diagonal", "alternating")
-MEMBRANE = 1e6
-"""C over D/m²: as of a thickness of 3.5 mm"""
 
 Section = list[tuple[tuple[float, float], tuple[float, float]]]
 FOOT, TOP, SIDE, END = (0.0, 0.0), (0.0, 1.0), (-1.0, 1.0), (1.0, 1.0)
