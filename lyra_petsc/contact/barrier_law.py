@@ -6,9 +6,6 @@ import math
 
 from lyra_petsc.kernels.element import kernel, leaf
 
-BISECTIONS = 30
-"""Bisections in the search for the distance at which the barrier has a given force."""
-
 
 @kernel(forceinline=True)  # not `inlined`, as δ may be an array
 def barrier(delta, gap):  # type: ignore[no-untyped-def]
@@ -19,16 +16,9 @@ def barrier(delta, gap):  # type: ignore[no-untyped-def]
 
 @leaf()
 def distance_of_force(force, gap):  # type: ignore[no-untyped-def]
-    """δ at which −b′ / k is ``force`` [m] > 0, or a little less."""
-    # the force is below 2 gap³ / δ² for small δ, so that it exceeds `force` at the lower end
-    low, high = min(0.5, 0.1 * math.sqrt(gap / (gap + force))) * gap, gap
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        if -barrier(middle, gap)[1] > force:
-            low = middle
-        else:
-            high = middle
-    return low
+    """δ at which −b′ / k is ``force`` [m] > 0: u = gap / δ is the largest root of u³ − p u + 2."""
+    p = 3.0 + force / gap
+    return gap / (2.0 * math.sqrt(p / 3.0) * math.cos(math.acos(-((3.0 / p) ** 1.5)) / 3.0))
 
 
 @leaf()

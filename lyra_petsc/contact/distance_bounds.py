@@ -169,7 +169,7 @@ def _update(pairs, motions, bounds, path_bounds):  # type: ignore[no-untyped-def
 
 @kernel()
 def _select(pairs, path_bounds, table, begins, radius, edge_radius, out, row, known):  # type: ignore[no-untyped-def]
-    found = 0
+    n_selected = 0
     for m in range(len(pairs)):
         i, j = pairs[m]
         if i >= len(begins) - 1:
@@ -179,16 +179,16 @@ def _select(pairs, path_bounds, table, begins, radius, edge_radius, out, row, kn
             t += 1
         if t == begins[i + 1]:
             t = -1
-        known[found] = 0.0
+        known[n_selected] = 0.0
         if t >= 0:
             if path_bounds[t, 0] >= radius and path_bounds[t, 1] >= edge_radius:
                 continue
             for k in range(2):
                 if path_bounds[t, k] > 0.0:
-                    known[found, k] = path_bounds[t, k]
-        out[found, 0], out[found, 1], row[found] = i, j, t
-        found += 1
-    return found
+                    known[n_selected, k] = path_bounds[t, k]
+        out[n_selected, 0], out[n_selected, 1], row[n_selected] = i, j, t
+        n_selected += 1
+    return n_selected
 
 
 @kernel()

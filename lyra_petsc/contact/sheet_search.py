@@ -61,9 +61,9 @@ class SheetSearch:
         self._patch, self._n = patch, int(patch.max(initial=-1)) + 1
         # the vertices of each patch once, as places among the corners of all triangles
         patch_corners = np.column_stack([np.repeat(patch, 3), surface.ravel()])
-        found, corner = np.unique(patch_corners, axis=0, return_index=True)
+        patch_vertices, corner = np.unique(patch_corners, axis=0, return_index=True)
         self._corners, self._n_own = corner, len(corner)
-        self._own_first = np.searchsorted(found[:, 0], np.arange(self._n + 1))
+        self._own_first = np.searchsorted(patch_vertices[:, 0], np.arange(self._n + 1))
         self._bounds = DistanceBounds(patches.neighbouring_patches(surface, uv, patch), self._own_first)
         self._same_patch = np.repeat(np.arange(self._n)[:, None], 2, axis=1)
         self._triangles: Ints | None = None
@@ -152,13 +152,13 @@ class SheetSearch:
             out, new_bounds = np.empty((self._capacity, 7), dtype=np.int64), known.copy()
             between = patch_pairs, known, extra, new_bounds, drift
             constants = 3 * patches.MAX_TRIANGLES, self._rings, float(limit)
-            n_found = _find_pairs(x, dx, *between, *simplices, numbers, *radii, *constants, out)
-            if n_found > limit:
+            n_pairs = _find_pairs(x, dx, *between, *simplices, numbers, *radii, *constants, out)
+            if n_pairs > limit:
                 return None
-            if n_found <= self._capacity:
+            if n_pairs <= self._capacity:
                 self._bounds.raise_to(row, new_bounds)
-                return out[:n_found]
-            self._capacity = n_found + n_found // 4
+                return out[:n_pairs]
+            self._capacity = n_pairs + n_pairs // 4
 
 
 @kernel()
@@ -255,11 +255,11 @@ def _find_pairs(  # type: ignore[no-untyped-def]
     ``new_bounds`` (n, 2) [m] then gets the bound that was found, at most radius + ``extra`` (n,) [m].
     ``drift`` is from `_swept_boxes`, the boxes of vertices, edges and triangles are from `_simplex_boxes`.
     """
-    found = 0
+    n_pairs = 0
     margin, p, w = np.empty(size_of_patch), np.empty((4, 3)), np.empty((4, 3))
     points, hits = np.empty(4, np.int64), np.empty(size_of_patch, np.int64)
     for n in range(len(patch_pairs)):
-        if found > limit:
+        if n_pairs > limit:
             break
         for part in range(3):
             i, j = patch_pairs[n]
@@ -322,11 +322,11 @@ def _find_pairs(  # type: ignore[no-untyped-def]
                         new_bounds[n, column] = bound
                     if bound >= limit_radius:
                         continue
-                    if found < len(out):
+                    if n_pairs < len(out):
                         swapped = part == 2 and numbers[points[0]] > numbers[points[2]]
-                        out[found, 0], out[found, 1] = kind, -1
-                        out[found, 6] = 0 if part == 2 else rings[b]
+                        out[n_pairs, 0], out[n_pairs, 1] = kind, -1
+                        out[n_pairs, 6] = 0 if part == 2 else rings[b]
                         for m in range(4):
-                            out[found, 2 + m] = points[(m + 2) % 4 if swapped else m]
-                    found += 1
-    return found
+                            out[n_pairs, 2 + m] = points[(m + 2) % 4 if swapped else m]
+                    n_pairs += 1
+    return n_pairs
