@@ -6,10 +6,12 @@ import importlib
 import importlib.metadata
 import os
 import platform
+import re
 import socket
 import sys
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,9 +54,9 @@ def info(comm: Any) -> str:
         )
     width = max(map(len, lines))
     text = [*(f"{name:<{width}}  {value}" for name, value in lines.items()), ""]
-    text += ["What does not fit together:", *(f"- {problem}" for problem in problems)] if problems else []
+    text.append("What does not fit together:" if problems else "All fits together.")
     # rank 0 decides: h5py and the libraries are the same files on every rank
-    return comm.bcast("\n".join(text if problems else [*text, "All fits together."]), root=0)
+    return str(comm.bcast("\n".join([*text, *(f"- {problem}" for problem in problems)]), root=0))
 
 
 def rank_problems(environment: Mapping[str, str], ranks: int, ranks_here: int, cores: int) -> Problems:
@@ -94,9 +96,7 @@ def loaded_mpi_libraries() -> list[str]:
         maps = Path("/proc/self/maps").read_text(errors="replace")
     except OSError:
         return []
-    files = {line.split(maxsplit=5)[5] for line in maps.splitlines() if len(line.split(maxsplit=5)) == 6}
-    names = ("libmpi.so", "libmpich.so", "libmpi_cray.so", "libmpi_gnu")
-    return sorted(file for file in files if Path(file).name.startswith(names))
+    return sorted(set(re.findall(r"/\S.*/(?:libmpi|libmpich|libmpi_cray|libmpi_gnu\w*)\.so\S*", maps)))
 
 
 def _described(name: str, describe: Callable[[Problems], str], problems: Problems) -> str:
@@ -111,12 +111,9 @@ def _described(name: str, describe: Callable[[Problems], str], problems: Problem
         return "broken"
 
 
-def _module_version(name: str) -> Callable[[Problems], str]:
-    def describe(problems: Problems) -> str:
-        module = importlib.import_module(name)
-        return str(getattr(module, "__version__", None) or importlib.metadata.version(name))
-
-    return describe
+def _module_version(name: str, problems: Problems) -> str:
+    module = importlib.import_module(name)
+    return str(getattr(module, "__version__", None) or importlib.metadata.version(name))
 
 
 def _mpi(problems: Problems) -> str:
@@ -157,8 +154,8 @@ def _petsc_packages(problems: Problems) -> str:
 def _h5py(problems: Problems) -> str:
     import h5py
 
-    kind = "parallel" if h5py.get_config().mpi else "serial"
-    return f"{h5py.__version__} with HDF5 {h5py.version.hdf5_version}, {kind}"
+    kinds = {True: "parallel", False: "serial"}
+    return f"{h5py.__version__} with HDF5 {h5py.version.hdf5_version}, {kinds[h5py.get_config().mpi]}"
 
 
 BUILT = ("mpi4py", "PETSc", "PETSc packages", "h5py", "gmsh")
@@ -169,6 +166,8 @@ PARTS: dict[str, Callable[[Problems], str]] = {
     "PETSc": _petsc,
     "PETSc packages": _petsc_packages,
     "h5py": _h5py,
-    **{name: _module_version(name) for name in ("gmsh", "numpy", "numba", "pydantic", "ruamel.yaml")},
+    **{
+        name: partial(_module_version, name) for name in ("gmsh", "numpy", "numba", "pydantic", "ruamel.yaml")
+    },
 }
 """The parts to describe, in this order; each function may also add problems."""

@@ -7,6 +7,7 @@ import sys
 import time as wall
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -87,11 +88,8 @@ class ProgressBar:
         self._pending = f"{fraction:4.0%}  {text}"
         due = since >= LINE_SECONDS and more >= LINE_FRACTION - 1e-9  # round-off
         if due or since >= LATEST_LINE_SECONDS:
-            self._print_pending()
-
-    def _print_pending(self) -> None:
-        self.say(self._pending)
-        self._shown_at, self._pending = self._at, ""
+            self.say(self._pending)
+            self._shown_at, self._pending = self._at, ""
 
     def close(self) -> None:
         """Show the last update and remove the bar."""
@@ -101,7 +99,8 @@ class ProgressBar:
                 self._bar.stop()
             self._bar = None
         elif self._pending:
-            self._print_pending()
+            self.say(self._pending)
+            self._pending = ""
 
     def __enter__(self) -> Self:
         return self
@@ -150,39 +149,24 @@ class StudyProgress(ProgressBar):
 def closing_table(phases: Mapping[str, float], folder: Path, outcome: str) -> None:
     """Print the wall time [s] of each phase, where the results are and how to open them; on one rank."""
     total = sum(phases.values())
+    rows = [*phases.items(), ("total", total)]
     lines = [f"{'phase':<12} {'wall time':>12} {'share':>5}"]
-    lines += [
-        f"{name:<12} {seconds:>10.2f} s {seconds / total:>5.0%}"
-        for name, seconds in [*phases.items(), ("total", total)]
-        if f"{seconds:.2f}" != "0.00"
-    ]
-    for name, text in (
-        ("results", folder),
-        ("open", f"paraview {folder / 'states.xdmf'}"),
-        ("outcome", outcome),
-    ):
-        lines.append(f"{name:<12} {text}")
+    lines += [f"{name:<12} {s:>10.2f} s {s / total:>5.0%}" for name, s in rows if f"{s:.2f}" != "0.00"]
+    lines += [f"results      {folder}", f"open         paraview {folder / 'states.xdmf'}"]
+    lines.append(f"outcome      {outcome}")
     with suppress(OSError):
         print("\n".join(lines), flush=True)
 
 
 def duration(seconds: float) -> str:
-    """A duration [s] as ``1:05:09`` or ``5:09``; ``?`` if it is not finite."""
-    if not math.isfinite(seconds):
-        return "?"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    """A duration [s] as ``1:05:09``; ``?`` if it is not finite."""
+    return str(timedelta(seconds=round(seconds))) if math.isfinite(seconds) else "?"
 
 
 def _bar(stream: TextIO) -> Bar:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-    return Progress(
-        BarColumn(bar_width=24),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[state]}", markup=False),
-        console=Console(file=stream),
-        auto_refresh=False,  # no thread beside MPI; redrawn with the steps
-    )
+    columns = BarColumn(24), TaskProgressColumn(), TextColumn("{task.fields[state]}", markup=False)
+    # no thread beside MPI; redrawn with the steps
+    return Progress(*columns, console=Console(file=stream), auto_refresh=False)

@@ -9,15 +9,13 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 
-from pydantic import ValidationError
-
 from lyra_petsc.arrays import Array
-from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import DIMENSION_NAMES
 from lyra_petsc.scene.json_schema import schema_file
 from lyra_petsc.scene.materials.library import material_names
+from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.schema import FIELDS, MeshSource
 
 _GRID = """\
@@ -51,7 +49,10 @@ def starter(scene: Path, commands: tuple[str, str], file: Path | None, *, trust_
         If the mesh cannot be used.
     """
     schema = schema_file()
-    mesh = None if file is None else _read(file, trust_mesh)
+    mesh = None
+    if file is not None:
+        source = validated(MeshSource, {"file": str(file)}, file=file)
+        mesh = build_mesh([source], trust_scripts=trust_mesh)
     text = files("lyra_petsc.cli").joinpath("starter.yaml").read_text(encoding="utf-8")
     return Template(text).substitute(
         schema=schema.as_uri() if " " in str(schema) and schema.is_absolute() else schema,
@@ -64,16 +65,6 @@ def starter(scene: Path, commands: tuple[str, str], file: Path | None, *, trust_
         cloths=", ".join(material_names()[:4]),
         fields=", ".join(name for name in FIELDS if name != "velocity"),
     )
-
-
-def _read(file: Path, trust_mesh: bool) -> Mesh:
-    try:
-        source = MeshSource.model_validate({"file": str(file)})
-    except ValidationError as error:
-        raise InputError(error.errors()[0]["msg"], key="--mesh") from None
-    if not file.is_file():
-        raise InputError(f"no such file: {file}", key="--mesh")
-    return build_mesh([source], trust_scripts=trust_mesh)
 
 
 def _mesh(file: Path, mesh: Mesh, scene: Path) -> str:

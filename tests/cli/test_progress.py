@@ -38,8 +38,8 @@ def shown(stream, seconds_per_step, steps=100, comm=FIRST, **options):
 
 def test_plain_lines_have_the_time_left():
     lines = shown(io.StringIO(), 0.5).splitlines()
-    assert lines[:2] == ["  1%  step 1", "  6%  step 6  0:47 left"]
-    assert lines[-2:] == ["a message [in brackets]", "100%  step 100  0:00 left"]
+    assert lines[:2] == ["  1%  step 1", "  6%  step 6  0:00:47 left"]
+    assert lines[-2:] == ["a message [in brackets]", "100%  step 100  0:00:00 left"]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_the_time_left_does_not_count_what_was_done_before():
             progress.show(0.25 + 0.05 * step, "")
     first, *_, last = stream.getvalue().splitlines()
     assert first.startswith(" 25%")
-    assert (last[:4], last[-9:]) == (" 50%", "1:40 left")
+    assert (last[:4], last[-12:]) == (" 50%", "0:01:40 left")
 
 
 def test_the_closing_table(capsys):
@@ -80,7 +80,7 @@ def test_the_closing_table(capsys):
     for words in ("25%", "75%", "2.00 s", "done: 4 s in 100 steps", f"paraview {folder}/states.xdmf"):
         assert words in text
     assert "other" not in text
-    assert [duration(s) for s in (0, 65.4, 3909, float("nan"))] == ["0:00", "1:05", "1:05:09", "?"]
+    assert [duration(s) for s in (65.4, 3909, float("nan"))] == ["0:01:05", "1:05:09", "?"]
 
 
 def test_lines_of_a_study_name_each_case_and_the_time_left():
@@ -98,6 +98,6 @@ def test_lines_of_a_study_name_each_case_and_the_time_left():
     assert lines[:2] == ["1/2 bdf2, Δt 10 ms: finished before", " 25%  1/2 bdf2, Δt 10 ms"]
     assert lines[2] == "2/2 bdf2, Δt 5 ms"
     # after 20 s for 2 of 30 units, fourteen times as long remains
-    assert lines[3] == " 30%  2/2 bdf2, Δt 5 ms  4:40 left"
+    assert lines[3] == " 30%  2/2 bdf2, Δt 5 ms  0:04:40 left"
     assert len(lines) < 20
     assert lines[-3:-1] == ["reference: bdf2, Δt 1.25 ms", "note: something"]
