@@ -14,9 +14,6 @@ WIDTH = 4
 FLAGS = ("contract", "nsz")
 """Permitted changes of sums and products: they may be fused, and the sign of zero may be ignored."""
 
-READ, KEEP, DATA = 0, 3, 1
-"""Arguments of ``llvm.prefetch``: for reading, into all caches, data and not instructions."""
-
 Value = Any
 """A value or a pointer in LLVM's intermediate representation."""
 
@@ -212,7 +209,8 @@ class CodeBuilder:
         byte = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [byte, LANE, LANE, LANE])
         function = self.builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
-        self.builder.call(function, [self.builder.bitcast(pointer, byte), LANE(READ), LANE(KEEP), LANE(DATA)])
+        how = LANE(0), LANE(3), LANE(1)  # for reading, into all caches, data and not instructions
+        self.builder.call(function, [self.builder.bitcast(pointer, byte), *how])
 
     def loop(self) -> Any:
         """A loop over the blocks from ``lo`` to ``hi``."""

@@ -14,6 +14,7 @@ local rows.
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints, read_only
 from lyra_petsc.kernels.cache import Index, cached
+from lyra_petsc.kernels.llvm import WIDTH
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
 from lyra_petsc.linear.pattern import MISSING, BlockPattern, block_of, index_type, row_pointers, union
 
@@ -30,13 +32,7 @@ if TYPE_CHECKING:
     from lyra_petsc.terms.term import MixedStencil, Offsets
 
 
-GROUP = 4
-"""Edges of a group."""
-
-ALIGNMENT = 4
-"""Groups begin after a multiple of this many 3 × 3 blocks, that is at a multiple of 16 bytes."""
-
-AHEAD_EDGES = 32
+AHEAD_EDGES = AHEAD // 2
 """Prefetch distance, in groups."""
 
 
@@ -120,19 +116,19 @@ class EdgeCouplings:
                     edges.append(lesser * beyond + greater)
             return mixed, edges
 
-        found = [keys(part) for part in elements]
-        vertex, column = np.divmod(union(*(key for mixed, _ in found for key in mixed)), max(beyond, 1))
+        mixed, of_edges = (list(itertools.chain(*parts)) for parts in zip(*map(keys, elements), strict=True))
+        vertex, column = np.divmod(union(*mixed), max(beyond, 1))
         count = np.bincount(vertex, minlength=first)
-        groups = row_pointers(-(-count // GROUP))
-        at = GROUP * groups[vertex] + np.arange(len(vertex)) - row_pointers(count)[vertex]
-        columns = np.full(GROUP * groups[-1], -1, dtype=np.int32)
+        groups = row_pointers(-(-count // WIDTH))
+        at = WIDTH * groups[vertex] + np.arange(len(vertex)) - row_pointers(count)[vertex]
+        columns = np.full(WIDTH * groups[-1], -1, dtype=np.int32)
         columns[at] = column
         # padding refers to an edge of the group, whose cache line is needed anyway
-        columns = columns.reshape(-1, GROUP)
+        columns = columns.reshape(-1, WIDTH)
         self.groups = Groups(groups, np.where(columns < 0, columns[:, :1], columns))
 
         diagonal = np.arange(3 * first, beyond, dtype=np.int64) * (beyond + 1)
-        one, other = np.divmod(union(diagonal, *(key for _, edges in found for key in edges)), max(beyond, 1))
+        one, other = np.divmod(union(diagonal, *of_edges), max(beyond, 1))
         indptr = row_pointers(np.bincount(one - 3 * first, minlength=len(diagonal)))
         self.entries = EdgeEntries(indptr.astype(index_type(len(other))), other.astype(np.int32))
 
@@ -149,8 +145,8 @@ class EdgeCouplings:
         return 2 * self.n_values - len(self.entries.indptr) + 1
 
     def first_group(self, n_blocks: int) -> int:
-        """Position of the first group, behind n_blocks blocks."""
-        return 9 * ALIGNMENT * -(-n_blocks // ALIGNMENT)
+        """Position of the first group, behind n_blocks blocks, at a multiple of four numbers."""
+        return 9 * WIDTH * -(-n_blocks // WIDTH)
 
     def first_entry(self, n_blocks: int) -> int:
         """Position of the first number."""
@@ -168,7 +164,7 @@ class EdgeCouplings:
     def parts(self, values: NDArray[Any], n_blocks: int) -> EdgeValues:
         """Views of values (n_stored, 3, 3)."""
         flat, first, last = values.reshape(-1), self.first_group(n_blocks), self.first_entry(n_blocks)
-        blocks, groups = flat[: 9 * n_blocks].reshape(-1, 9), flat[first:last].reshape(-1, 3 * GROUP)
+        blocks, groups = flat[: 9 * n_blocks].reshape(-1, 9), flat[first:last].reshape(-1, 3 * WIDTH)
         return EdgeValues(blocks, groups, flat[last : last + len(self.entries.columns)].reshape(-1, 1))
 
     def offsets_of(self, elements: MixedStencil, pattern: BlockPattern) -> Offsets:
@@ -208,7 +204,7 @@ class EdgeCouplings:
     def _coupled(self) -> tuple[Ints, Ints, Ints, Ints]:
         """Rows and columns of all groups' entries, then of all edge entries, as indices of unknowns."""
         vertex = np.repeat(np.arange(self.n_vertices), np.diff(self.groups.indptr))
-        shape = (len(vertex), 3, GROUP)
+        shape = (len(vertex), 3, WIDTH)
         row = np.broadcast_to((3 * vertex[:, None] + np.arange(3))[:, :, None], shape).ravel()
         column = np.broadcast_to(self.groups.columns[:, None, :], shape).ravel()
         edge = np.repeat(np.arange(3 * self.n_vertices, 3 * self._n), np.diff(self.entries.indptr))
@@ -234,8 +230,8 @@ class EdgeCouplings:
         def position(row: Ints, column: Ints) -> Ints:
             """Blocks are stored column by column."""
             block = np.searchsorted(keys, (row // 3) * n_local + column // 3)
-            found: Ints = 9 * block + 3 * (column % 3) + row % 3
-            return found
+            entry: Ints = 9 * block + 3 * (column % 3) + row % 3
+            return entry
 
         row, column, edge, other = self._coupled()
         # added, as the padding of a group repeats an edge with value 0
@@ -260,50 +256,51 @@ def _look_up(  # type: ignore[no-untyped-def]
         pair = 0
         for a in range(stencil.shape[1]):
             for b in range(max(a, n), stencil.shape[1]):
-                found = -1
+                position = -1
                 one, other = stencil[e, a], stencil[e, b]
                 row, column = min(one, other), max(one, other)
                 if row < n_owned:
                     if column >= n_owned:
-                        found = block_of(indptr, columns, row, column)
-                        if found >= 0:
-                            c_b = edges[e, b - n] % 3
-                            if a < n:
-                                found = 4 * (9 * found + 3 * c_b) if one == row else 4 * (9 * found + c_b) + 2
-                            else:
-                                c_a = edges[e, a - n] % 3
-                                i, j = (c_a, c_b) if one == row else (c_b, c_a)
-                                found = 9 * found + 3 * j + i
+                        block = block_of(indptr, columns, row, column)
+                        c_b = edges[e, b - n] % 3
+                        if block < 0:
+                            position = block
+                        elif a < n:
+                            position = 4 * (9 * block + 3 * c_b) if one == row else 4 * (9 * block + c_b) + 2
+                        else:
+                            c_a = edges[e, a - n] % 3
+                            i, j = (c_a, c_b) if one == row else (c_b, c_a)
+                            position = 9 * block + 3 * j + i
                     elif a < n:
-                        found = MISSING
+                        position = MISSING
                         for k in range(4 * group_ptr[one], 4 * group_ptr[one + 1]):
                             if columns4[k // 4, k % 4] == edges[e, b - n]:
-                                found = 4 * (first_group + 12 * (k // 4) + k % 4) + 3
+                                position = 4 * (first_group + 12 * (k // 4) + k % 4) + 3
                                 break
                     else:
                         lesser, greater = edges[e, a - n], edges[e, b - n]
                         if lesser > greater:
                             lesser, greater = greater, lesser
-                        found = MISSING
+                        position = MISSING
                         edge = lesser - 3 * n_vertices
                         for k in range(entry_ptr[edge], entry_ptr[edge + 1]):
                             if columns1[k] == greater:
-                                found = first_entry + k
+                                position = first_entry + k
                                 break
-                out[e, pair] = found
+                out[e, pair] = position
                 pair += 1
 
 
 @cached(fastmath={"contract", "nsz"})
 def multiply(  # type: ignore[no-untyped-def]
-    indptr, ends, columns, group_ptr, columns4, entry_ptr, columns1, blocks, groups, entries, x, sums, out
+    ptr, ends, columns, group_ptr, columns4, entry_ptr, columns1, blocks, groups, entries, x, u, sums, out, v
 ):
-    """out (n_owned, 3) = A x for x (n_local, 3); sums (n_vertices, 4) is scratch."""
+    """out (n_owned, 3) = A x for x (n_local, 3); u and v are both flattened, sums (n_vertices, 4) scratch."""
     n, n_owned = Index(len(sums)), Index(len(ends))
     sums[:] = 0.0
     out[n:] = 0.0
     for row in range(n):
-        lo, hi = Index(indptr[row]), Index(indptr[row + Index(1)])
+        lo, hi = Index(ptr[row]), Index(ptr[row + Index(1)])
         s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
         mine = x[row, 0], x[row, 1], x[row, 2]
         scatter(blocks, columns, sums, lo + Index(1), Index(ends[row]), mine)
@@ -312,18 +309,18 @@ def multiply(  # type: ignore[no-untyped-def]
         scatter_edges(groups, columns4, out, lo, hi, mine)
         out[row, 0], out[row, 1] = s0 + t0 + sums[row, 0], s1 + t1 + sums[row, 1]
         out[row, 2] = s2 + t2 + sums[row, 2]
-    first, flat, to = Index(3) * n, x.reshape(-1), out.reshape(-1)
+    first = Index(3) * n
     for edge in range(Index(len(entry_ptr) - 1)):
         lo, hi = Index(entry_ptr[edge]), Index(entry_ptr[edge + Index(1)])
-        mine = flat[first + edge]
+        mine = u[first + edge]
         s0 = entries[lo, 0] * mine
         for k in range(lo + Index(1), hi):
             other = Index(columns1[k])
-            s0 += entries[k, 0] * flat[other]
-            to[other] += entries[k, 0] * mine
-        to[first + edge] += s0
+            s0 += entries[k, 0] * u[other]
+            v[other] += entries[k, 0] * mine
+        v[first + edge] += s0
     for row in range(n, n_owned):
-        lo, hi = Index(indptr[row]), Index(indptr[row + Index(1)])
+        lo, hi = Index(ptr[row]), Index(ptr[row + Index(1)])
         if lo < hi:
             s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
             out[row, 0] += s0
@@ -350,4 +347,5 @@ class ProductWithEdges:
 
     def __call__(self, x: Array, out: Array) -> None:
         """out (n_owned, 3) = A x for x (n_local, 3) with current ghost values."""
-        multiply(*self._rows, read_only(x), np.empty((self._n_vertices, 4)), out)
+        x, sums = read_only(x), np.empty((self._n_vertices, 4))
+        multiply(*self._rows, x, x.reshape(-1), sums, out, out.reshape(-1))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
+from lyra_petsc.kernels.llvm import WIDTH
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
 from lyra_petsc.linear.edge_couplings import AHEAD_EDGES
 from lyra_petsc.linear.gauss_seidel import (
@@ -38,12 +39,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 
-EDGES_EVERY = 2
-"""Sweeps over the vertices for one over the edges."""
-
-ALIGNMENT = 8
-"""Vectors begin at a multiple of this many float64 numbers."""
-
 SWEEPS = ((0.03, (3, 3, 3)), (0.3, (2, 2, 2)))
 """Upper bounds of inertia's share in the stiffness of the vertices' softest directions, and the numbers of
 sweeps over the vertices on the finest level, the next coarser one, and those below; else one. Among
@@ -51,17 +46,19 @@ numbers that cost equal time these let iterations grow least with the mesh."""
 
 
 def memory_sizes(pattern: BlockPattern) -> tuple[int, int]:
-    """Memory of `SweepsWithEdges`, in float64 numbers: of the copy of its rows, and of its vectors."""
-    return ALIGNMENT * -(-9 * pattern.n_stored // (2 * ALIGNMENT)), 8 * pattern.n_local
+    """Memory of `SweepsWithEdges`, in float64 numbers: of the copy of its rows, and of its vectors.
+
+    The vectors begin at a multiple of four, so that no row of the residual lies on two cache lines.
+    """
+    return WIDTH * -(-9 * pattern.n_stored // (2 * WIDTH)), 8 * pattern.n_local
 
 
 @cached()
 def invert_edge_diagonal(indptr, entries, inverse):  # type: ignore[no-untyped-def]
-    """inverse (n_rows, 3), flattened = inverses of the edges' diagonal entries; 0 for entries of 0."""
-    flat = inverse.reshape(-1)
-    for edge in range(Index(len(flat))):
+    """inverse (n_edges,) = inverses of the edges' diagonal entries; 0 for entries of 0."""
+    for edge in range(Index(len(inverse))):
         value = entries[Index(indptr[edge]), 0]
-        flat[edge] = 1.0 / value if value != 0.0 else 0.0
+        inverse[edge] = 1.0 / value if value != 0.0 else 0.0
 
 
 @cached()
@@ -75,49 +72,46 @@ def _sum_of_traces(weight, blocks):  # type: ignore[no-untyped-def]
 
 @cached(fastmath=True)
 def backward_edges(first, indptr, columns, entries, inverse, x, r):  # type: ignore[no-untyped-def]
-    """``gauss_seidel.backward`` over the owned edges, from index ``first`` on, in x and r (n_local, 3).
+    """``gauss_seidel.backward`` over the owned edges, from index ``first`` on, in x and r (3 n_local,).
 
     An edge depends on the edge processed before it, which is mostly its first coupling: that one is added
     last, here and in ``forward_edges``, so that the processor need not wait.
     """
-    flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
-    n, first = Index(len(inverses)), Index(first)
-    for below in range(n):
-        edge = n - Index(1) - below
+    n, first = Index(len(inverse)), Index(first)
+    for swept in range(n):
+        edge = n - Index(1) - swept
         at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
-        s = rest[at]
+        s = r[at]
         for k in range(hi - lo):
-            s -= entries[hi - Index(1) - k, 0] * flat[Index(columns[hi - Index(1) - k])]
-        y = flushed(inverses[edge] * s)
-        decrement = flat[at] - y
-        flat[at], rest[at] = y, 0.0
+            s -= entries[hi - Index(1) - k, 0] * x[Index(columns[hi - Index(1) - k])]
+        y = flushed(inverse[edge] * s)
+        decrement = x[at] - y
+        x[at], r[at] = y, 0.0
         for k in range(lo, hi):
-            rest[Index(columns[k])] += entries[k, 0] * decrement
+            r[Index(columns[k])] += entries[k, 0] * decrement
 
 
 @cached(fastmath=True)
 def forward_edges(first, indptr, columns, entries, inverse, x, r):  # type: ignore[no-untyped-def]
     """``gauss_seidel.forward`` over the owned edges; couplings to ghosts are already subtracted from r."""
-    flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
     first = Index(first)
-    for edge in range(Index(len(inverses))):
+    for edge in range(Index(len(inverse))):
         at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
         s = entries.dtype.type(0.0)
         for k in range(lo, hi):
-            s += entries[k, 0] * flat[Index(columns[k])]
-        y = flushed(inverses[edge] * (rest[at] - s))
-        flat[at] = y
+            s += entries[k, 0] * x[Index(columns[k])]
+        y = flushed(inverse[edge] * (r[at] - s))
+        x[at] = y
         for k in range(lo, hi):
-            rest[Index(columns[k])] -= entries[k, 0] * y
+            r[Index(columns[k])] -= entries[k, 0] * y
 
 
 @cached(fastmath=True)
 def correct_edges(first, inverse, x, r):  # type: ignore[no-untyped-def]
-    """x += D⁻¹ r in the owned edges' unknowns; x and r (n_local, 3)."""
-    flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
+    """x += D⁻¹ r in the owned edges' unknowns; x and r (3 n_local,)."""
     first = Index(first)
-    for edge in range(Index(len(inverses))):
-        flat[first + edge] += flushed(inverses[edge] * rest[first + edge])
+    for edge in range(Index(len(inverse))):
+        x[first + edge] += flushed(inverse[edge] * r[first + edge])
 
 
 @cached(fastmath=True)
@@ -126,8 +120,8 @@ def backward_vertices(  # type: ignore[no-untyped-def]
 ):
     """``gauss_seidel.backward`` over the owned vertices, after that over the edges."""
     n = Index(len(inverse))
-    for below in range(n):
-        row = n - Index(1) - below
+    for swept in range(n):
+        row = n - Index(1) - swept
         lo, hi = Index(indptr[row] + 1), Index(ends[row])
         first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
         s0, s1, s2 = gather(blocks, columns, x, lo, hi, -AHEAD)
@@ -177,8 +171,8 @@ def backward_again(  # type: ignore[no-untyped-def]
     increment (n_vertices, 3) is what the sweep adds to x.
     """
     n = Index(len(inverse))
-    for below in range(n):
-        row = n - Index(1) - below
+    for swept in range(n):
+        row = n - Index(1) - swept
         lo, hi = Index(indptr[row] + 1), Index(ends[row])
         s0, s1, s2 = gather(blocks, columns, increment, lo, hi, -AHEAD)
         y0, y1, y2 = solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
@@ -234,7 +228,7 @@ class SweepsWithEdges:
         self._copy = memory[:of_rows].view(np.float32)[: 9 * pattern.n_stored].reshape(-1, 9)
         self._values = couplings.parts(self._copy, pattern.n_blocks)
         self._inverse = np.empty((n, 9), dtype=np.float32)
-        self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
+        self._inverse_of_edges = np.empty(3 * (pattern.n_owned - n), dtype=np.float32)
         vectors = memory[of_rows : of_rows + of_vectors].view(np.float32)
         self._changing = vectors[: 13 * n_local]  # all but b
         self._clean = False
@@ -255,11 +249,11 @@ class SweepsWithEdges:
 
     def diagonal(self, values: Array, rows: Ints) -> Array:
         """Blocks (n, 9) of rows (n,) that sweeps invert, from (n_stored, 9); for edges only the diagonal."""
-        found, edges = np.zeros((len(rows), 9)), rows >= len(self._inverse)
-        found[~edges] = values[self._rows[0][rows[~edges]]]
+        blocks, edges = np.zeros((len(rows), 9)), rows >= len(self._inverse)
+        blocks[~edges] = values[self._rows[0][rows[~edges]]]
         own = self._couplings.diagonal(self._n_blocks).reshape(-1, 3)[rows[edges] - len(self._inverse)]
-        found[np.flatnonzero(edges)[:, None], [0, 4, 8]] = values.reshape(-1)[own]
-        return found
+        blocks[np.flatnonzero(edges)[:, None], [0, 4, 8]] = values.reshape(-1)[own]
+        return blocks
 
     def inertia(self, values: Array) -> Array:
         """Sums (2,) over owned vertices of inertia, and of the stiffness in their softest directions.
@@ -290,7 +284,7 @@ class SweepsWithEdges:
         """Divide the inverses of the diagonal of rows (n,) by ``factor`` (n, 1)."""
         edges = rows >= len(self._inverse)
         self._inverse[rows[~edges]] /= factor[~edges]
-        self._inverse_of_edges[rows[edges] - len(self._inverse)] /= factor[edges]
+        self._inverse_of_edges.reshape(-1, 3)[rows[edges] - len(self._inverse)] /= factor[edges]
 
     def begin(self, b: Floats) -> None:
         """Set the residual to b (n_local, 3), that of x = 0."""
@@ -311,13 +305,14 @@ class SweepsWithEdges:
     def backward(self, x: Floats) -> None:
         """Sweep over the edges, then over the vertices."""
         blocks, groups, entries = self._values
-        backward_edges(self._first, *self._entries, entries, self._inverse_of_edges, x, self.of_edges)
+        flat = x.reshape(-1), self.of_edges.reshape(-1)
+        backward_edges(self._first, *self._entries, entries, self._inverse_of_edges, *flat)
         rows = *self._rows, *self._groups, blocks, groups
         backward_vertices(*rows, self._inverse, x, self.r, self.of_edges)
 
     def backward_again(self, x: Floats, number: int) -> None:
         """Sweep over the vertices once more, and if ``number`` is even over the edges before that."""
-        if number % EDGES_EVERY == 0:
+        if number % 2 == 0:
             self.increment[:] = 0.0
             self.backward(self.increment)
             x += self.increment
@@ -333,14 +328,14 @@ class SweepsWithEdges:
 
     def correct(self, x: Floats) -> bool:
         """Add the residual of owned edges over their diagonal to x (n_local, 3); True, as x has changed."""
-        correct_edges(self._first, self._inverse_of_edges, x, self.of_edges)
+        correct_edges(self._first, self._inverse_of_edges, x.reshape(-1), self.of_edges.reshape(-1))
         return True
 
     def forward(self, b: Floats, x: Floats, number: int = 0) -> None:
         """Sweep over the vertices, and if ``number`` is even over the edges after that."""
         blocks, groups, entries = self._values
         rows = *self._rows, *self._groups, blocks, groups
-        if number % EDGES_EVERY:
+        if number % 2:
             forward_vertices(*rows, self._inverse, b, x, self.r, None)
             return
         forward_vertices(*rows, self._inverse, b, x, self.r, self.of_edges)
@@ -348,5 +343,6 @@ class SweepsWithEdges:
         before = self.of_edges[with_ghosts]
         subtract_ghosts(with_ghosts, *self._rows, blocks, x, self.of_edges)
         of_ghosts = before - self.of_edges[with_ghosts]
-        forward_edges(self._first, *self._entries, entries, self._inverse_of_edges, x, self.of_edges)
+        flat = x.reshape(-1), self.of_edges.reshape(-1)
+        forward_edges(self._first, *self._entries, entries, self._inverse_of_edges, *flat)
         self.of_edges[with_ghosts] += of_ghosts  # the residual of vertices does not contain ghosts either

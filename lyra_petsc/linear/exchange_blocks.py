@@ -9,23 +9,20 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
 
-STRAIGHT, TRANSPOSED, BOTH = 0, 1, 2
-"""How a block is sent: as it is, transposed, or the sum of both (for half of a diagonal block)."""
-
 
 @cached()
-def _pack(blocks, source, how, out):  # type: ignore[no-untyped-def]
-    """Send buffer out (n, 9) from blocks (m, 9)."""
+def _pack(blocks, source, straight, transposed, out):  # type: ignore[no-untyped-def]
+    """Send buffer out (n, 9) from blocks (m, 9): each as it is, transposed, or the sum of both.
+
+    The sum is for diagonal blocks, of which one half is stored.
+    """
     for k in range(len(source)):
         for i in range(3):
             for j in range(3):
-                straight, transposed = blocks[source[k], 3 * i + j], blocks[source[k], 3 * j + i]
-                if how[k] == STRAIGHT:
-                    out[k, 3 * i + j] = straight
-                elif how[k] == TRANSPOSED:
-                    out[k, 3 * i + j] = transposed
-                else:
-                    out[k, 3 * i + j] = straight + transposed
+                entry = blocks[source[k], 3 * i + j] if straight[k] else 0.0
+                if transposed[k]:
+                    entry += blocks[source[k], 3 * j + i]
+                out[k, 3 * i + j] = entry
 
 
 @cached()
@@ -64,13 +61,14 @@ class SharedBlocks:
         direct = symmetric | (owner != other) | (row <= column)  # another block provides the other half
         mirrored = symmetric & (owner != other)
         source = np.concatenate([number[direct], number[mirrored]])
-        how_direct = np.where(symmetric & (row == column), BOTH, STRAIGHT)[direct]
-        how = np.concatenate([how_direct, np.full(int(mirrored.sum()), TRANSPOSED)])
+        is_mirror = np.arange(len(source)) >= np.count_nonzero(direct)
+        is_both = (symmetric & (row == column))[source] & ~is_mirror
         rows = np.concatenate([row[direct], column[mirrored]])
         columns = np.concatenate([column[direct], row[mirrored]])
         to = np.concatenate([owner[direct], other[mirrored]])
         order = np.argsort(to, kind="stable")
-        self._source, self._how = source[order], how[order].astype(np.int8)
+        self._source, self._straight = source[order], ~is_mirror[order]
+        self._transposed = (is_mirror | is_both)[order]
         out = np.bincount(to, minlength=comm.size)
         ends = np.cumsum(out)[:-1]
         sent = zip(np.split(rows[order], ends), np.split(columns[order], ends), strict=True)
@@ -90,7 +88,7 @@ class SharedBlocks:
         if self._comm.size == 1:
             return
         send, received = np.empty((len(self._source), 9)), np.empty((len(self._target), 9))
-        _pack(blocks, self._source, self._how, send)
+        _pack(blocks, self._source, self._straight, self._transposed, send)
         out_counts, in_counts = self._counts
         self._comm.Alltoallv([send, out_counts], [received, in_counts])
         _add(received, self._target, out)

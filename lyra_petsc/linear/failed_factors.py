@@ -18,8 +18,8 @@ FACTOR_TYPES = frozenset(
 WORKSPACE_ERRORS = (-8, -9, -17, -20)
 """Values of INFOG(1) for which a larger ICNTL(14) helps."""
 
-MARGIN, MORE, LARGEST = 20, 4, 2000
-"""Initial ICNTL(14) of MUMPS [%], the factor by which it grows, and its largest value."""
+LARGEST_MARGIN = 2000
+"""Largest ICNTL(14) of MUMPS that is tried [%]."""
 
 
 def replace_failed(ksp: PETSc.KSP) -> bool:
@@ -45,11 +45,15 @@ def _enlarge_workspace(pc: PETSc.PC) -> bool:
     if pc.getType() not in ("lu", "cholesky") or pc.getFactorSolverType() != "mumps":
         return False
     factors = pc.getFactorMatrix()
-    if factors.getMumpsInfog(1) not in WORKSPACE_ERRORS:
+    margin = larger_margin(factors)
+    if margin is None:
         return False
-    margin = factors.getMumpsIcntl(14)
-    if margin >= LARGEST:
-        return False
-    name = f"{factors.getOptionsPrefix() or ''}mat_mumps_icntl_14"
-    PETSc.Options().setValue(name, max(MARGIN, MORE * margin))
+    PETSc.Options().setValue(f"{factors.getOptionsPrefix() or ''}mat_mumps_icntl_14", margin)
     return True
+
+
+def larger_margin(factors: PETSc.Mat) -> int | None:
+    """A larger ICNTL(14) [%] for factors of MUMPS that failed; None if it would not help."""
+    margin = factors.getMumpsIcntl(14)
+    helps = factors.getMumpsInfog(1) in WORKSPACE_ERRORS and margin < LARGEST_MARGIN
+    return max(20, 4 * margin) if helps else None

@@ -18,10 +18,7 @@ from lyra_petsc.phases import GALERKIN, logged
 CHUNK_ROWS = 1 << 13
 """Fine rows whose products are processed together when the coarse pattern is built."""
 
-CHUNK_PRODUCTS = 1 << 20
-"""Products whose offsets are computed together."""
-
-FAR = 255
+FAR = np.iinfo(np.uint8).max
 """Replaces an offset that does not fit into a byte, or that of a block outside the owned coarse rows."""
 
 
@@ -244,8 +241,9 @@ class Galerkin:
         inside = blocks < len(in_row)
         short[inside] = np.minimum(in_row[blocks[inside]], FAR)
         offset, far = np.empty(len(target), dtype=np.uint8), [np.empty(0, dtype=np.int64)]
-        for lo in range(0, len(target), CHUNK_PRODUCTS):
-            part = target[lo : lo + CHUNK_PRODUCTS]
+        size = 128 * CHUNK_ROWS  # about as many as a chunk of rows has
+        for lo in range(0, len(target), size):
+            part = target[lo : lo + size]
             key = np.where(part < 0, ~part, part)
             offset[lo : lo + len(part)] = short[key]
             beyond = short[key] == FAR
@@ -277,8 +275,8 @@ class Galerkin:
         q = 0
         for lo, hi in chunks:
             new = keys_of(lo, hi)
-            found = np.searchsorted(keys, np.where(new < 0, ~new, new))
-            target[q : q + len(new)] = np.where(new < 0, ~found, found)
+            position = np.searchsorted(keys, np.where(new < 0, ~new, new))
+            target[q : q + len(new)] = np.where(new < 0, ~position, position)
             q += len(new)
         return keys, target
 

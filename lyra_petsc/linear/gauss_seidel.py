@@ -157,8 +157,8 @@ def backward(indptr, ends, columns, blocks, inverse, x, r):  # type: ignore[no-u
     unchanged ghosts.
     """
     n = Index(len(ends))
-    for below in range(n):
-        row = n - Index(1) - below
+    for swept in range(n):
+        row = n - Index(1) - swept
         lo, hi = Index(indptr[row] + 1), Index(ends[row])
         s0, s1, s2 = gather(blocks, columns, x, lo, hi, -AHEAD)
         y0, y1, y2 = solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
@@ -258,8 +258,8 @@ class BlockSweeps:
 
     def diagonal(self, values: Array, rows: Ints) -> Array:
         """Blocks (n, 9) of rows (n,) that sweeps invert, from block rows (n_blocks, 9)."""
-        found: Array = values[self._rows[0][rows]]
-        return found
+        blocks: Array = values[self._rows[0][rows]]
+        return blocks
 
     def invert(self, values: Array) -> None:
         """Invert the diagonal blocks of block rows (n_blocks, 9)."""

@@ -25,7 +25,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.linear.block_rows import BlockRows
-from lyra_petsc.linear.failed_factors import LARGEST, WORKSPACE_ERRORS
+from lyra_petsc.linear.failed_factors import larger_margin
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.mesh.points import Layout
@@ -47,9 +47,6 @@ eigenvalues at which it ends."""
 RIGID = 1e-6
 """Mean square change of a rigid motion, relative to its own, by which a motion without supports still counts
 as rigid."""
-
-MORE = 100.0
-"""Factor by which the shift that makes the matrix positive definite grows."""
 
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 """Inverse golden ratio, whose multiples modulo 1 are evenly distributed."""
@@ -139,11 +136,11 @@ class Inertia:
 
     def pivots(self) -> Pivots | None:
         """Numbers of motions without positive stiffness; None if the factors do not fit into memory."""
-        below = self._negative(-1.0)
-        above = self._negative(1.0) if below else 0
-        if below is None or above is None:
+        lowered = self._negative(-1.0)
+        negative = self._negative(1.0) if lowered else 0
+        if lowered is None or negative is None:
             return None
-        negative, neutral = above, below - above
+        neutral = lowered - negative
         supported = self._examine_rigid_motions()
         if not negative and 0 < neutral <= MAX_REFINED:
             negative, neutral = self._examine_modes(neutral)
@@ -156,13 +153,13 @@ class Inertia:
         self._matrix.set(values)
         while True:
             factors = self._factor()
-            error = factors.getMumpsInfog(1)
-            if error >= 0:
+            if factors.getMumpsInfog(1) >= 0:
                 self._shift = shift
                 return int(factors.getMumpsInfog(12))
-            if error not in WORKSPACE_ERRORS or self._margin >= LARGEST:
+            margin = larger_margin(factors)
+            if margin is None:
                 return None
-            self._margin *= 4
+            self._margin = margin
 
     def _factor(self) -> PETSc.Mat:
         self._free_solver()
@@ -295,7 +292,7 @@ class Inertia:
         else:
             shift = 1.0
             while negative := self._negative(shift):
-                shift *= MORE
+                shift *= 100.0
             if negative is None:
                 return None
             mode = self._lowest_modes(shift, 1)[0]
@@ -313,15 +310,15 @@ class Inertia:
             self._examine_rigid_motions()
         assert self._supported_motions is not None
         parts = self._dots(self._supported_motions, force[None])[:, 0] / self._stiffness
-        found: Array = self._supported(force) + np.tensordot(parts, self._supported_motions, 1)
-        return found
+        displacement: Array = self._supported(force) + np.tensordot(parts, self._supported_motions, 1)
+        return displacement
 
     def _supported(self, force: Array) -> Array:
         """Displacement (n_owned, 3) [m] for a force (n_owned, 3) [N] of the matrix with supports."""
         assert self._ksp is not None
         scale = self._scale[: len(force)]
-        found: Array = scale * self._matrix.solve(self._ksp, scale * force)
-        return found
+        displacement: Array = scale * self._matrix.solve(self._ksp, scale * force)
+        return displacement
 
     def _product(self, u: Array) -> Array:
         """The force (n_owned, 3) on unknowns that are not prescribed, for a displacement (n_local, 3)."""

@@ -277,10 +277,10 @@ class AssembledMatrix:
         x, b = self.mat.createVecs()
         b.setArray(right.ravel())
         ksp.solve(b, x)
-        found: Array = x.getArray(readonly=True).reshape(right.shape).copy()
+        solution: Array = x.getArray(readonly=True).reshape(right.shape).copy()
         x.destroy()
         b.destroy()
-        return found
+        return solution
 
     def destroy(self) -> None:
         """Free the matrix; collective."""

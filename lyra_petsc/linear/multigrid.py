@@ -11,11 +11,9 @@ from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.linear.hierarchy import Hierarchy
 from lyra_petsc.linear.matrix import BlockMatrix
+from lyra_petsc.linear.pattern import LARGEST_INT32
 from lyra_petsc.linear.presets import PYTHON_TYPE
 from lyra_petsc.linear.vcycle import VCycle
-
-MAX_LEVELS = 20
-"""Default of ``-pc_mg_levels``; includes the finest level."""
 
 
 def is_requested() -> bool:
@@ -30,8 +28,8 @@ def is_requested() -> bool:
 
 
 def max_levels() -> int:
-    """The largest number of levels, ``-pc_mg_levels``."""
-    return max(1, int(PETSc.Options().getInt("pc_mg_levels", MAX_LEVELS)))
+    """The largest number of levels, ``-pc_mg_levels``, with the finest; otherwise as many as there are."""
+    return max(1, int(PETSc.Options().getInt("pc_mg_levels", LARGEST_INT32)))
 
 
 class Multigrid:

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 Offsets = NDArray[np.int32] | NDArray[np.int64]
 
-LARGEST_INT32 = 2**31 - 1
-
+LARGEST_INT32 = np.iinfo(np.int32).max
 
 MISSING = -2
 """Offset of a coupling that has no block."""
@@ -55,12 +54,12 @@ def _look_up(indptr, columns, stencil, out):  # type: ignore[no-untyped-def]
         for a in range(stencil.shape[1]):
             for b in range(a, stencil.shape[1]):
                 row, column = min(stencil[e, a], stencil[e, b]), max(stencil[e, a], stencil[e, b])
-                found = -1
+                offset = -1
                 if row < len(indptr) - 1:
-                    found = block_of(indptr, columns, row, column)
-                    if found >= 0:
-                        found = 2 * found + (1 if stencil[e, a] < stencil[e, b] else 0)
-                out[e, pair] = found
+                    offset = block_of(indptr, columns, row, column)
+                    if offset >= 0:
+                        offset = 2 * offset + (1 if stencil[e, a] < stencil[e, b] else 0)
+                out[e, pair] = offset
                 pair += 1
 
 
@@ -128,12 +127,12 @@ class BlockPattern:
 
     def missing(self, stencils: Iterable[NDArray[np.int32]], n_local: int) -> Ints:
         """Keys row · n_local + column, ascending, of blocks that further elements need and this lacks."""
-        found = [np.empty(0, dtype=np.int64)]
+        keys = [np.empty(0, dtype=np.int64)]
         for stencil in stencils:
             one, other = (stencil[:, side] for side in np.array(_pairs(stencil)).T.reshape(2, -1))
             at = np.flatnonzero(self.offsets_of(stencil).ravel() == MISSING)
-            found.append(_keys(one.ravel()[at], other.ravel()[at], n_local))
-        return union(*found)
+            keys.append(_keys(one.ravel()[at], other.ravel()[at], n_local))
+        return union(*keys)
 
     def locate(self, stencils: Mapping[str, NDArray[np.int32]]) -> None:
         """Look up the offsets of further elements; `MISSING` for couplings without a block."""
@@ -223,8 +222,8 @@ class BlockPattern:
     @property
     def n_couplings(self) -> int:
         """Blocks in both halves of the owned rows; nine entries of edges count as a block."""
-        found = self.n_blocks + int(np.count_nonzero(self.columns < self.n_owned)) - self.n_diagonal
-        return found if self.edge_couplings is None else found + self.edge_couplings.n_entries // 9
+        blocks = self.n_blocks + int(np.count_nonzero(self.columns < self.n_owned)) - self.n_diagonal
+        return blocks if self.edge_couplings is None else blocks + self.edge_couplings.n_entries // 9
 
     @cached_property
     def whole(self) -> BlockPattern:
@@ -291,8 +290,8 @@ def _all_keys(couplings: Couplings, n_diagonal: int, n_owned: int, n_local: int)
         stencil = _stencil(coupling)
         # row by row of the elements, as all pairs at once take much memory
         for _, pairs in groupby(_pairs(coupling), key=itemgetter(0)):
-            found = (_keys(stencil[:, a], stencil[:, b], n_local) for a, b in pairs)
-            keys = union(keys, *(stored(part) for part in found))
+            of_pairs = (_keys(stencil[:, a], stencil[:, b], n_local) for a, b in pairs)
+            keys = union(keys, *map(stored, of_pairs))
     return keys
 
 

@@ -127,11 +127,11 @@ def unused(defaults: list[str]) -> list[str]:
     get.argtypes = [ctypes.c_void_p] * 4
     if get(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)):
         return []
-    found = [names[i].decode() for i in range(count.value)]
+    left = [names[i].decode() for i in range(count.value)]
     restore = library.PetscOptionsLeftRestore
     restore.argtypes = [ctypes.c_void_p] * 4
     restore(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
-    return sorted(set(found) - set(defaults) - READ_AT_THE_END)
+    return sorted(set(left) - set(defaults) - READ_AT_THE_END)
 
 
 def unknown(defaults: list[str]) -> list[str]:
@@ -140,7 +140,7 @@ def unknown(defaults: list[str]) -> list[str]:
     Names and prefixes of options stand as texts in PETSc's libraries: names with a dash before them, numbers
     as %d. A prefix with a number counts without it, too, as it then stands for all numbers.
     """
-    if not (given := unused(defaults)):
+    if not (left := unused(defaults)):
         return []
     texts = b"".join(file.read_bytes() for file in _libraries()).decode("latin-1")
     names = set(re.findall(r"\0-([a-z][\w%]*)(?=\0)", texts))
@@ -159,7 +159,7 @@ def unknown(defaults: list[str]) -> list[str]:
                 yield from without_prefixes(name[mark.end() :])
 
     notes = []
-    for name in given:
+    for name in left:
         stems = list(without_prefixes(name.lower()))
         if not any(stem in names or re.sub(r"\d+", "%d", stem) in names for stem in stems):
             similar = [

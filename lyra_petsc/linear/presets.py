@@ -106,11 +106,9 @@ FACTOR_COST = 200.0, 6.5
 Measured are 300 to 400 for 1000 to 5000 vertices; a buckling sheet needs several factorisations an iteration.
 """
 
-GAIN, GAIN_INCOMPLETE = 4.0, 2.0
-"""Iterations of block Jacobi that one of multigrid, or of incomplete factors, replaces at least."""
-
 COST, COST_INCOMPLETE = 4.0, 2.0
-"""Cost of such an iteration, in iterations of block Jacobi."""
+"""Cost of an iteration of multigrid, and of incomplete factors, in iterations of block Jacobi, of which it
+replaces at least as many."""
 
 INCOMPLETE_FROM = 1.0
 """Expected iterations of block Jacobi (about thirty in fact) from which Newton iterations of a small sheet
@@ -148,7 +146,7 @@ def candidates(
     several = ranks > 1 or PETSc.Options().getString("mat_type", "").startswith("mpi")
     incomplete = "block-ilu" if several else "ilu"
     small = n_vertices < MULTIGRID_FROM[newton]
-    if iterations > _factor_cost(n_vertices) * (GAIN_INCOMPLETE if small else GAIN):
+    if iterations > _factor_cost(n_vertices) * (COST_INCOMPLETE if small else COST):
         return [*factors, *last]
     if not small:
         return [cycle, *factors, incomplete, "gamg", "block-jacobi"]

@@ -150,9 +150,9 @@ def _finite(text: str) -> bool:
 def _check_class(option: str, name: str) -> None:
     module, _, cls = name.rpartition(".")
     try:
-        found = getattr(importlib.import_module(module), cls)
+        context = getattr(importlib.import_module(module), cls)
     except Exception as error:
         why = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise InputError(f"'{name}' cannot be imported ({why})", key=f"-{option}") from None
-    if not callable(found):
+    if not callable(context):
         raise InputError(f"'{name}' is no class", key=f"-{option}")

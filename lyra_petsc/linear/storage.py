@@ -27,33 +27,32 @@ PORTIONS = 16
 
 
 @cached(inline="always")
-def _put(block, out, at, row_stride, column_stride):  # type: ignore[no-untyped-def]
-    """Copy a stored block to ``out`` from index ``at`` on, with these strides of its rows and columns."""
+def _put(blocks, k, out, at, row_stride, column_stride):  # type: ignore[no-untyped-def]
+    """Copy block k to ``out`` from index ``at`` on, with these strides of its rows and columns."""
     for i in range(3):
         for j in range(3):
-            out[at + row_stride * i + column_stride * j] = block[i, j]
+            out[at + row_stride * i + column_stride * j] = blocks[k, 3 * i + j]
 
 
 @cached()
-def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
-    """Fill the arrays of a BAIJ matrix, column by column of blocks; owned and ghost columns are separate."""
+def _to_baij(indptr, columns, begin, lower, blocks, inside, outside):  # type: ignore[no-untyped-def]
+    """Fill the arrays (n, 9) of a BAIJ matrix, blocks column by column; ghost columns are separate."""
     n, p, q = len(indptr) - 1, 0, 0
-    blocks, inner, outer = values.reshape(-1, 9), inside.reshape(-1, 9), outside.reshape(-1, 9)
     for row in range(n):
         for t in range(begin[row], begin[row + 1]):
-            store_block(blocks, below[t], inner, 2 * p + 1)
+            store_block(blocks, lower[t], inside, 2 * p + 1)
             p += 1
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] < n:
-                store_block(blocks, k, inner, 2 * p)
+                store_block(blocks, k, inside, 2 * p)
                 p += 1
             else:
-                store_block(blocks, k, outer, 2 * q)
+                store_block(blocks, k, outside, 2 * q)
                 q += 1
 
 
 @cached()
-def _to_aij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
+def _to_aij(indptr, columns, begin, lower, blocks, inside, outside):  # type: ignore[no-untyped-def]
     """Fill the arrays of an AIJ matrix, three scalar rows a block row; ghost columns are separate."""
     n, p, q = len(indptr) - 1, 0, 0
     for row in range(n):
@@ -65,30 +64,30 @@ def _to_aij(indptr, columns, begin, below, values, inside, outside):  # type: ig
                 beyond += 3
         at = p
         for t in range(begin[row], begin[row + 1]):
-            _put(values[below[t]], inside, at, width, 1)
+            _put(blocks, lower[t], inside, at, width, 1)
             at += 3
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] < n:
-                _put(values[k], inside, at, 1, width)
+                _put(blocks, k, inside, at, 1, width)
                 at += 3
         at = q
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] >= n:
-                _put(values[k], outside, at, 1, beyond)
+                _put(blocks, k, outside, at, 1, beyond)
                 at += 3
         p += 3 * width
         q += 3 * beyond
 
 
 @cached()
-def _transposes(indptr, columns, place, below):  # type: ignore[no-untyped-def]
-    """below = blocks of the upper triangle ordered by columns; ``place`` (n_owned,) is where each begins."""
+def _transposes(indptr, columns, place, lower):  # type: ignore[no-untyped-def]
+    """lower = blocks of the upper triangle ordered by columns; ``place`` (n_owned,) is where each begins."""
     n = len(indptr) - 1
     for row in range(n):
         for k in range(indptr[row] + 1, indptr[row + 1]):
             c = columns[k]
             if c < n:
-                below[place[c]] = k
+                lower[place[c]] = k
                 place[c] += 1
 
 
@@ -105,7 +104,7 @@ class StoredRows:
     ----------
     inside, outside : (n_owned,) int
         Blocks of each row in owned columns, and in columns of ghosts.
-    begin, below : (n_owned + 1,) int64, (n_below,) int
+    begin, lower : (n_owned + 1,) int64, (n_lower,) int
         Compressed rows of the lower triangle: blocks of the pattern that must be transposed.
     """
 
@@ -115,12 +114,12 @@ class StoredRows:
         own = columns < n
         self._kept = np.ones(len(columns), dtype=bool)
         if kind == "sbaij":
-            self.begin, self.below = np.zeros(n + 1, dtype=np.int64), np.empty(0, dtype=np.int32)
+            self.begin, self.lower = np.zeros(n + 1, dtype=np.int64), np.empty(0, dtype=np.int32)
             self._kept[~own] = points.ghosts[columns[~own] - n] > points.start
         else:
             self.begin = row_pointers(np.bincount(columns[own], minlength=n) - 1)
-            self.below = np.empty(self.begin[-1], dtype=index_type(len(columns)))
-            _transposes(indptr, columns, self.begin[:-1].copy(), self.below)
+            self.lower = np.empty(self.begin[-1], dtype=index_type(len(columns)))
+            _transposes(indptr, columns, self.begin[:-1].copy(), self.lower)
         self.inside = (np.diff(self.begin) + _per_row(own, indptr)).astype(PETSc.IntType)
         self.outside = _per_row(self._kept & ~own, indptr).astype(PETSc.IntType)
 
@@ -131,9 +130,9 @@ class StoredRows:
         if not kept.all():
             columns, values, indptr = columns[kept], values[kept], row_pointers(_per_row(kept, indptr))
         _set(mat, indptr, numbers[columns], values)
-        edges = np.linspace(0, len(self.below), PORTIONS + 1).astype(np.int64)
+        edges = np.linspace(0, len(self.lower), PORTIONS + 1).astype(np.int64)
         for lo, hi in itertools.pairwise(edges):
-            part = self.below[lo:hi]
+            part = self.lower[lo:hi]
             rows = np.searchsorted(self._pattern.indptr, part, side="right") - 1
             # petsc4py requires all rows, most of which are empty here
             _set(mat, np.clip(self.begin, lo, hi) - lo, numbers[rows], values[part].transpose(0, 2, 1))
@@ -174,18 +173,19 @@ class Storage:
         self._get = getattr(library, f"MatSeq{name}GetArray")
         self._restore = getattr(library, f"MatSeq{name}RestoreArray")
         self._mat = mat
-        self._rows = pattern.indptr, pattern.columns, stored.begin, stored.below
+        self._rows = pattern.indptr, pattern.columns, stored.begin, stored.lower
         self._sizes = 9 * int(stored.inside.sum()), 9 * int(stored.outside.sum())
         self._split = (
             getattr(library, f"MatMPI{name}GetSeq{name}") if mat.getType().startswith("mpi") else None
         )
-        self._fill = {"aij": _to_aij, "baij": _to_baij}[kind]
+        self._fill, self._shape = {"aij": (_to_aij, (-1,)), "baij": (_to_baij, (-1, 9))}[kind]
 
     def write(self, values: Array) -> None:
         """Replace all entries by block rows (n_blocks, 3, 3); collective."""
         parts = self._parts()
         arrays = [self._array(part, size) for part, size in zip(parts, self._sizes, strict=False)]
-        self._fill(*self._rows, values, *arrays, *[np.empty(0)] * (2 - len(arrays)))
+        arrays += [np.empty(0)] * (2 - len(arrays))
+        self._fill(*self._rows, values.reshape(-1, 9), *(array.reshape(self._shape) for array in arrays))
         for part in parts:
             self._restore(part, ctypes.byref(ctypes.c_void_p()))
         self._mat.assemble()

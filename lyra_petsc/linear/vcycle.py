@@ -38,9 +38,6 @@ MAX_TWICE = 3
 """Largest number of levels visited twice: each doubles the visits of coarser ones, where ranks mostly
 wait."""
 
-HUGE = 1e30
-"""Factor of a result that marks a failed cycle; no preconditioner has entries of this size."""
-
 MAX_COUPLING = 0.9
 """Largest sum of a row's couplings to other ranks, relative to the diagonal blocks, without an increase."""
 
@@ -108,8 +105,8 @@ class Smoother:
         from lyra_petsc.linear.edge_sweeps import SWEEPS  # only needed here
 
         inertia, stiffness = self.points.comm.allreduce(own)
-        found = (numbers for bound, numbers in SWEEPS if inertia < bound * stiffness)
-        n_sweeps, *coarse = next(found, (1, 1, 1))
+        numbers = (numbers for bound, numbers in SWEEPS if inertia < bound * stiffness)
+        n_sweeps, *coarse = next(numbers, (1, 1, 1))
         self.n_sweeps, self.coarse_sweeps = self._vertex_sweeps or n_sweeps, (coarse[0], coarse[1])
 
     def _increase_diagonal(self, values: Array) -> None:
@@ -127,13 +124,13 @@ class Smoother:
         self.points.update_ghosts(packed)
         sums = np.empty(len(self._with_ghosts))
         sweeps.relative_couplings(self._with_ghosts, *self._rows, values, roots, sums)
-        found = np.flatnonzero(sums > MAX_COUPLING)
-        self._increased = rows = self._with_ghosts[found]
-        if len(found):
-            growth = (sums[found, None] - MAX_COUPLING) / 2.0
+        strong = np.flatnonzero(sums > MAX_COUPLING)
+        self._increased = rows = self._with_ghosts[strong]
+        if len(strong):
+            growth = (sums[strong, None] - MAX_COUPLING) / 2.0
             self._sweeps.shrink(rows, 1.0 + growth)
-            self._increase = (growth * diagonal[found]).astype(np.float32).reshape(-1, 3, 3)
-        self._in_residual = np.zeros((len(found), 3), dtype=np.float32)
+            self._increase = (growth * diagonal[strong]).astype(np.float32).reshape(-1, 3, 3)
+        self._in_residual = np.zeros((len(strong), 3), dtype=np.float32)
 
     def sweep_down(self, coarse: Floats, *, again: bool) -> None:
         """Sweep before the coarser level; ``coarse`` (n_local coarse, 3) = restricted residual; collective.
@@ -295,12 +292,12 @@ class VCycle:
         finest, n = self._levels[0], b.getLocalSize() // 3
         finest.b[:n] = b.getArray(readonly=True).reshape(-1, 3)
         self._visit(0)
-        found = finest.x[:n]
-        if math.isfinite(float(np.vdot(found, found))):
-            x.getArray()[:] = found.ravel()
+        result = finest.x[:n]
+        if math.isfinite(float(np.vdot(result, result))):
+            x.getArray()[:] = result.ravel()
         else:
             # sweeps of an indefinite matrix may diverge; with this result PETSc reports an indefinite PC
-            x.getArray()[:] = -HUGE * b.getArray(readonly=True)
+            x.getArray()[:] = -b.getArray(readonly=True)
 
     def _visit(self, number: int, *, again: bool = False) -> None:
         """Compute x of a level for its b, from zero or, if ``again``, from the present x; collective."""
@@ -308,12 +305,12 @@ class VCycle:
         if isinstance(level, Coarsest):
             level.solve()
             return
-        below = self._levels[coarser]
-        level.sweep_down(below.b, again=again)
+        coarse_level = self._levels[coarser]
+        level.sweep_down(coarse_level.b, again=again)
         self._visit(coarser)
         if 0 < self._twice_from <= coarser < min(self._twice_from + MAX_TWICE, len(self._levels) - 1):
             self._visit(coarser, again=True)
-        level.sweep_up(below.x)
+        level.sweep_up(coarse_level.x)
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         """For ``-ksp_view`` and ``-snes_view``."""
