@@ -120,7 +120,7 @@ def test_terms_do_not_use_petsc_mpi_or_files() -> None:
         assert not names & {"petsc4py", "mpi4py", "h5py", "os", "io", "pathlib"}, path.name
 
 
-COMPILERS = ("cached", "kernel", "leaf", "njit")
+COMPILERS = ("cached", "inner", "inlined", "kernel", "leaf", "njit", "subkernel")
 
 
 def kernels(tree: ast.AST) -> list[ast.FunctionDef]:

@@ -58,7 +58,7 @@ from lyra_petsc.contact.pair_distances import (
     stands_behind,
 )
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel, leaf
+from lyra_petsc.kernels.element import kernel, leaf, subkernel
 from lyra_petsc.kernels.scatter import AHEAD, add_element, fetch_ahead
 from lyra_petsc.kernels.vector3 import combined, dot, minus, point, scaled
 from lyra_petsc.kernels.vectors import add_outers
@@ -318,7 +318,7 @@ def find_active(x, x_obs, kind, points, offset, gap, stiffness, parallel, shares
     return _write_points(x, x_obs, points, n_points, nearest, *constants, n, out, q)
 
 
-@kernel()
+@subkernel()
 def _enlarged(keys, link, n):  # type: ignore[no-untyped-def]
     """Copies with more than n + 1 rows."""
     new_keys, new_link = np.empty((2 * n + 64, 4), dtype=np.int64), np.full(2 * n + 64, -1)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints, Mask
-from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.cache import cached, inner
 
 UNDECIDED = 2
 """Result where products of coordinates overflow or underflow, so that expansions are not exact."""
@@ -84,7 +84,7 @@ def side(points: Any, a: int, b: int, c: int, d: int) -> int:
     return int(_exact_side(points, a, b, c, d))
 
 
-@cached()
+@inner()
 def _exact_side(points: Any, a: int, b: int, c: int, d: int) -> int:
     """`side` by expansions."""
     parts = np.empty((3, 3, 2))
@@ -112,7 +112,7 @@ def _exact_side(points: Any, a: int, b: int, c: int, d: int) -> int:
     return int(np.sign(expansion[size - 1])) if size else 0
 
 
-@cached()
+@inner()
 def _two_sum(a: float, b: float) -> tuple[float, float]:
     """a + b rounded, and the rounding error (Knuth's two-sum)."""
     total = a + b
@@ -120,7 +120,7 @@ def _two_sum(a: float, b: float) -> tuple[float, float]:
     return total, (a - (total - virtual)) + (b - virtual)
 
 
-@cached()
+@inner()
 def _two_product(a: float, b: float) -> tuple[float, float]:
     """a b rounded, and the rounding error (Dekker's product with Veltkamp's splitting)."""
     total = a * b
@@ -132,7 +132,7 @@ def _two_product(a: float, b: float) -> tuple[float, float]:
     return total, a_low * b_low - (((total - a_high * b_high) - a_low * b_high) - a_high * b_low)
 
 
-@cached()
+@inner()
 def _grow_expansion(expansion: Any, size: int, number: float) -> int:
     """Add a number to the expansion in the first ``size`` entries, in place; returns its new size without
     zeros.
@@ -357,7 +357,7 @@ def _search(
     return pairs[:count], decided[:count]
 
 
-@cached()
+@inner()
 def _are_disjoint(low: Any, high: Any, other_low: Any, other_high: Any) -> bool:
     """Whether two boxes have no point in common."""
     return bool(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.cache import cached, inner
 
 MAX_CELLS = 1 << 22
 """Cells of the grid, at most."""
 
 
-@cached()
+@inner()
 def _cell(coordinate, origin, size, n):  # type: ignore[no-untyped-def]
     """Number of the cell that contains a coordinate, or of the nearest one of n."""
     # in a box that is flat except for rounding, cell numbers may exceed the range of integers

@@ -16,7 +16,7 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.contact.crossings import mutual_crossings, self_crossings
 from lyra_petsc.errors import InputError
-from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.cache import cached, inner
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.symmetry import Wall, symmetry_walls
@@ -199,7 +199,7 @@ def _distances(points: Any, triangles: Any, start: Any, end: Any) -> Any:
     return distances
 
 
-@cached()
+@inner()
 def _face_distance(a: Any, b: Any, c: Any, normal: Any, point: Any) -> float:
     """Distance of a point from its projection onto a triangle; inf if the projection is outside of it."""
     x = _dot(_cross(b - point, c - point), normal)
@@ -212,7 +212,7 @@ def _face_distance(a: Any, b: Any, c: Any, normal: Any, point: Any) -> float:
     return float(np.sqrt(_dot(gap, gap)))
 
 
-@cached()
+@inner()
 def _segment_distance(a: Any, b: Any, c: Any, d: Any) -> float:
     """Distance of two segments (Ericson, Real-Time Collision Detection, 2005, section 5.1.9)."""
     first, second, offset = b - a, d - c, a - c
@@ -226,12 +226,12 @@ def _segment_distance(a: Any, b: Any, c: Any, d: Any) -> float:
     return float(np.sqrt(_dot(gap, gap)))
 
 
-@cached()
+@inner()
 def _cross(a: Any, b: Any) -> Any:
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-@cached()
+@inner()
 def _dot(a: Any, b: Any) -> float:
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import inlined, kernel, leaf
+from lyra_petsc.kernels.element import inlined, kernel, leaf, subkernel
 from lyra_petsc.kernels.vector3 import cross, dot, minus
 
 VERTEX_TRIANGLE, EDGE_EDGE, VERTEX_PLANE, VERTEX_INSIDE = 0, 1, 2, 3
@@ -83,7 +83,7 @@ def nearest_in_triangle(p, a, b, c):  # type: ignore[no-untyped-def]
     return vb / total, vc / total
 
 
-@kernel()
+@subkernel()
 def _nearest_on_edges(a, b, c, d):  # type: ignore[no-untyped-def]
     """Parameters s and t of the nearest points of edges a b and c d: 0 at a and c, 1 at b and d.
 

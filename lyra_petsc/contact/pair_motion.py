@@ -33,7 +33,7 @@ MAX_ADVANCES = 1000
 lead past each other."""
 
 
-@leaf()
+@kernel(_nrt=False)
 def largest_approach(dx, dx_obs):  # type: ignore[no-untyped-def]
     """Largest distance [m] by which two points, one of them of a sheet, can approach each other."""
     largest = largest_norm(dx, 0, len(dx))

@@ -16,10 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.datamodel.models import OpaqueModel
 from numba.core.registry import cpu_target
 from numba.core.sigutils import normalize_signature
+from numba.extending import register_model, typeof_impl
 
 from lyra_petsc.kernels.compilation import COMPILATION
 
@@ -99,11 +101,21 @@ class KernelCache(FunctionCache):
                 file.unlink(missing_ok=True)
 
 
+KERNELS: dict[str, Any] = {}
+"""Kernels of the modules that are imported, by `kernel_name`."""
+
+
+def kernel_name(kernel: Any) -> str:
+    """Module and name of a kernel."""
+    return f"{kernel.py_func.__module__}:{kernel.py_func.__qualname__}"
+
+
 def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorator like ``numba.njit(cache=True)``; ``options`` are numba's."""
 
     def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(**options)(function)
+        dispatcher = njit(**options | {"no_cfunc_wrapper": True})(function)
+        KERNELS[kernel_name(dispatcher)] = dispatcher
         try:
             dispatcher._cache = KernelCache(function)
         except RuntimeError:  # numba found no place for the cache
@@ -111,3 +123,40 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return dispatcher
 
     return compiled
+
+
+class InnerFunction:
+    """A function that is compiled only as a part of other functions; Python calls ``py_func``, not compiled.
+
+    Otherwise numba would compile code by which Python calls it, too, which takes as long as the function.
+    """
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self.py_func = function
+        wrappers = dict.fromkeys(("no_cfunc_wrapper", "no_cpython_wrapper"), True)
+        self.dispatcher: Any = njit(**options | wrappers)(function)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.py_func(*args)
+
+
+class InnerFunctionType(types.Dispatcher):
+    """Numba's type of an `InnerFunction`, which is not compiled again for each literal number."""
+
+    def get_call_type(self, context: Any, args: Any, keywords: Any) -> Any:
+        """Signature for these types of arguments."""
+        kinds = tuple(map(types.unliteral, args))
+        return super().get_call_type(context, kinds, keywords)
+
+
+register_model(InnerFunctionType)(OpaqueModel)
+
+
+@typeof_impl.register(InnerFunction)
+def _type_of_inner(function: InnerFunction, context: Any) -> InnerFunctionType:
+    return InnerFunctionType(function.dispatcher)
+
+
+def inner(**options: Any) -> Callable[[Callable[..., Any]], InnerFunction]:
+    """Decorator for functions that only compiled functions call; ``options`` are numba's."""
+    return lambda function: InnerFunction(function, options)

@@ -9,12 +9,15 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.cache import cached, inner
 
 kernel: Any = partial(cached, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
 
-leaf: Any = partial(kernel, _nrt=False)
-"""For functions that kernels call and that create no arrays: without reference counting of their arguments.
+subkernel: Any = partial(inner, **kernel.keywords)
+"""For functions that only kernels call."""
+
+leaf: Any = partial(subkernel, _nrt=False)
+"""For those that create no arrays, either: without reference counting of their arguments.
 Numba counts references in a whole function or not at all, and atomic counting takes several times as long as
 a few sums."""
 

@@ -7,7 +7,7 @@ block. Offsets of edge unknowns are from ``edge_couplings.offsets_of``.
 
 from __future__ import annotations
 
-from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.cache import cached, inner
 from lyra_petsc.kernels.vectors import fetch
 
 AHEAD = 8
@@ -15,7 +15,7 @@ AHEAD = 8
 memory."""
 
 
-@cached(forceinline=True)
+@inner(forceinline=True)
 def fetch_ahead(element, offsets, values, n_pairs, ahead=AHEAD):  # type: ignore[no-untyped-def]
     """Prefetch the blocks of a later element with offsets (E, n_pairs) into the caches."""
     later = min(element + ahead, offsets.shape[0] - 1)
@@ -23,7 +23,7 @@ def fetch_ahead(element, offsets, values, n_pairs, ahead=AHEAD):  # type: ignore
         fetch(values, offsets[later, pair] >> 1)
 
 
-@cached(fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def add_element(weight, blocks, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight times the blocks (n, n, 3, 3) of one element to values (n_blocks, 3, 3)."""
     pair = 0

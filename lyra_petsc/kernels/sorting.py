@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lyra_petsc.arrays import Ints
-from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.cache import cached, inner
 
 INSERTED = 16
 """Number of rows up to which rows with the same number in the first column are sorted by insertion."""
@@ -18,7 +18,7 @@ def sort_rows(rows: Ints, keys: Ints) -> Ints:
     return order
 
 
-@cached()
+@inner()
 def _is_before(a, b, keys):  # type: ignore[no-untyped-def]
     """Whether row a precedes row b, without the first column."""
     for k in range(1, keys.shape[1]):
@@ -46,7 +46,7 @@ def _sort_runs(order, spare, keys):  # type: ignore[no-untyped-def]
         begin = end
 
 
-@cached()
+@inner()
 def _insert(order, begin, end, keys):  # type: ignore[no-untyped-def]
     """Sort the rows from begin to end by insertion."""
     for m in range(begin + 1, end):
@@ -57,7 +57,7 @@ def _insert(order, begin, end, keys):  # type: ignore[no-untyped-def]
         order[i] = row
 
 
-@cached()
+@inner()
 def _merge(order, spare, begin, middle, end, keys):  # type: ignore[no-untyped-def]
     """Merge two sorted parts."""
     a, b = begin, middle

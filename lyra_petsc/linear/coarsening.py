@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.cache import cached, inner
 from lyra_petsc.linear.pattern import row_pointers
 from lyra_petsc.mesh.partitioner import vertex_graph
 from lyra_petsc.mesh.topology import boundary_edges
@@ -116,7 +116,7 @@ def _choose_coarse(start: Ints, neighbours: Ints, border: NDArray[np.int8]) -> N
     return chosen
 
 
-@cached()
+@inner()
 def _decide_from(start, neighbours, seed, only, border, greedy, state, layer, ordered, degree):  # type: ignore[no-untyped-def]
     """Decide on the vertices with border ≥ only that are reachable from seed, breadth first.
 
@@ -154,7 +154,7 @@ def _decide_from(start, neighbours, seed, only, border, greedy, state, layer, or
         n = m
 
 
-@cached()
+@inner()
 def _sort_descending(vertices, key, ordered):  # type: ignore[no-untyped-def]
     """ordered = vertices by descending key (N,), stable (counting sort)."""
     largest = 0
@@ -210,13 +210,13 @@ def _nearest_coarse(x, start, neighbours, label):  # type: ignore[no-untyped-def
     return owner
 
 
-@cached()
+@inner()
 def _dot(u, v):  # type: ignore[no-untyped-def]
     """Dot product of 3-vectors; numpy's needs SciPy in numba, which need not be installed."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-@cached()
+@inner()
 def _barycentric(p, a, b, c):  # type: ignore[no-untyped-def]
     """Barycentric coordinates of p, projected onto the triangle's plane; −∞ for a triangle without area."""
     u, v, w = b - a, c - a, p - a
@@ -259,7 +259,7 @@ def _interpolate(x, start, neighbours, label, owner, vertices, triangles, first,
             weights[v, i] /= total
 
 
-@cached()
+@inner()
 def _interpolate_on_line(x, start, neighbours, label, vertices, v, parents, weights):  # type: ignore[no-untyped-def]
     """Interpolate vertex v linearly between two coarse neighbours, if it lies well between two of them."""
     best = 0.25
@@ -276,7 +276,7 @@ def _interpolate_on_line(x, start, neighbours, label, vertices, v, parents, weig
                 weights[v, 0], weights[v, 1], weights[v, 2] = 1.0 - s, s, 0.0
 
 
-@cached()
+@inner()
 def _drop_small(parents, weights, lo, hi):  # type: ignore[no-untyped-def]
     """Drop small weights among lo..hi, and rescale the others to the same sum; returns their new end."""
     before = after = 0.0

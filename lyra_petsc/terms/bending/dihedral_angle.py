@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from lyra_petsc.kernels.element import inlined, kernel
+from lyra_petsc.kernels.element import inlined, kernel, subkernel
 from lyra_petsc.kernels.vector3 import combined, cross, dot, minus, scaled
 
 
@@ -72,7 +72,7 @@ def triangle_derivatives(length, u, p, m):  # type: ignore[no-untyped-def]
     return n, (steep - w1, w1, -steep), (b0, b1, b2), scaled(0.5 / (length * length), up)
 
 
-@kernel()
+@subkernel()
 def add_angle_hessian(x0, x1, x2, x3, scale, out):  # type: ignore[no-untyped-def]
     """Add scale times the Hessian of θ [1/m²] to out (4, 4, 3, 3): [a, b, i, j] = ∂²θ / ∂x_a,i ∂x_b,j."""
     e = minus(x1, x0)

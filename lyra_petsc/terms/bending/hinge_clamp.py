@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import kernel, subkernel
 from lyra_petsc.kernels.vector3 import point
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
@@ -42,7 +42,7 @@ def energies(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
         out[e] = hinge_energy(theta, square1, square2, k[e], rest[e], (limit[e], 0.0))
 
 
-@kernel()
+@subkernel()
 def _gradient(x, s, mirror, k, rest, limit, e, g):  # type: ignore[no-untyped-def]
     """Write g (4, 3) [1/m] and return a moment [N·m]; their product is the gradient [N] of the energy of
     edge e by its three vertices and the mirror image.

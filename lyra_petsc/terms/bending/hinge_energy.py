@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.kernels.element import inlined, kernel
+from lyra_petsc.kernels.element import inlined, kernel, subkernel
 from lyra_petsc.kernels.vector3 import cross, dot, minus
 from lyra_petsc.terms.bending.dihedral_angle import add_angle_hessian, angle_gradients
 
@@ -47,7 +47,7 @@ def fade(square, limit):  # type: ignore[no-untyped-def]
     return a * a * a * (10.0 - 15.0 * a + 6.0 * a * a), first, second
 
 
-@kernel()
+@subkernel()
 def hinge_weight(square1, square2, limit1, limit2):  # type: ignore[no-untyped-def]
     """w(a1) w(a2); 1 unless a triangle has lost nearly all its area."""
     return fade(square1, limit1)[0] * fade(square2, limit2)[0]
@@ -71,7 +71,7 @@ def _write_angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
     return square1, square2
 
 
-@kernel()
+@subkernel()
 def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[no-untyped-def]
     """Write g (4, 3) [1/m] and return a moment [N·m]; their product is the energy's gradient [N]."""
     square1, square2 = _write_angle_gradient(x0, x1, x2, x3, g)
@@ -101,14 +101,14 @@ def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, convexity, g, out):  #
         _fade_hessian(x0, x1, x2, x3, square1, square2, limits[0], limits[1], k, change, convexity, g, out)
 
 
-@kernel()
+@subkernel()
 def _normals(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     """Normals [m²] of triangles (0, 1, 2) and (1, 0, 3), of length twice the area."""
     e = minus(x1, x0)
     return cross(e, minus(x2, x0)), cross(minus(x3, x0), e)
 
 
-@kernel()
+@subkernel()
 def _square_gradients(x0, x1, x2, x3, out):  # type: ignore[no-untyped-def]
     """Write ∇|n|² [m³] of both triangles into out (2, 4, 3): 2 ε × n with the edge ε opposite each corner."""
     n1, n2 = _normals(x0, x1, x2, x3)
@@ -127,7 +127,7 @@ def _set_row(row, values):  # type: ignore[no-untyped-def]
     row[0], row[1], row[2] = values
 
 
-@kernel()
+@subkernel()
 def _fade_gradient(  # type: ignore[no-untyped-def]
     x0, x1, x2, x3, square1, square2, limit1, limit2, change, g
 ):
@@ -146,7 +146,7 @@ def _fade_gradient(  # type: ignore[no-untyped-def]
     return change
 
 
-@kernel()
+@subkernel()
 def add_square_hessian(y, n, at, scale, out):  # type: ignore[no-untyped-def]
     """Add scale ∂²|n|²/∂y² of a triangle with corners y to out (4, 4, 3, 3).
 
@@ -167,7 +167,7 @@ def add_square_hessian(y, n, at, scale, out):  # type: ignore[no-untyped-def]
                 block[j, i] -= 2.0 * scale * turn * n[k]
 
 
-@kernel()
+@subkernel()
 def _fade_hessian(  # type: ignore[no-untyped-def]
     x0, x1, x2, x3, square1, square2, limit1, limit2, k, change, convexity, g, out
 ):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lyra_petsc.kernels.element import inlined, kernel
+from lyra_petsc.kernels.element import inlined, kernel, subkernel
 from lyra_petsc.kernels.scatter import add_element
 from lyra_petsc.kernels.vector3 import point
 from lyra_petsc.terms.bending.dihedral_angle import angle_parts
@@ -68,7 +68,7 @@ def _same_block(at, swapped):  # type: ignore[no-untyped-def]
     return 2 * (at >> 1) + int(swapped) if at >= 0 else at
 
 
-@kernel()
+@subkernel()
 def hinge_offsets(h, s, sides, within, across, out):  # type: ignore[no-untyped-def]
     """Write the offsets of all couplings of hinge h into out (10,)."""
     one, two, p, q = sides[h, 0] >> 2, sides[h, 1] >> 2, sides[h, 0] & 3, sides[h, 1] & 3

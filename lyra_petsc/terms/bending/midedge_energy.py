@@ -36,7 +36,7 @@ import math
 import numpy as np
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import inlined, kernel
+from lyra_petsc.kernels.element import inlined, kernel, subkernel
 from lyra_petsc.kernels.vector3 import cross, dot, point, scaled
 from lyra_petsc.kernels.vectors import add_corners, fetch
 from lyra_petsc.terms.bending.hinge_energy import VANISHED, add_square_hessian, fade
@@ -139,7 +139,7 @@ def _combine(a, u, b, v, c, w):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel()
+@subkernel()
 def _load_constants(  # type: ignore[no-untyped-def]
     edges, sign, frame, tangent, stiffness, rest, friction, length, first, batch
 ):
@@ -209,7 +209,7 @@ def _corner_gradients(e0, e1, e2, normal, square, spins, moments):  # type: igno
     )
 
 
-@kernel()
+@subkernel()
 def _compute_gradients(batch):  # type: ignore[no-untyped-def]
     """Store the gradients by the corners 1 and 2 and by the edges' unknowns in rows 37 to 45 of a batch.
 
@@ -316,7 +316,7 @@ def _second_derivative(spin, e, square, n, scale, moment):  # type: ignore[no-un
     return _symmetric(n, scaled(scale, cross(e, n)), scaled(-0.5 * moment, spin), about)
 
 
-@kernel()
+@subkernel()
 def _fade_hessian(x0, x1, x2, normal, square, limit, energy, exact, moments, g1, g2, q, hessian):  # type: ignore[no-untyped-def]
     """The Hessian of w E from that of E, both in the form that `_hessian` returns.
 
@@ -486,7 +486,7 @@ def _load_block(batch, row, i):  # type: ignore[no-untyped-def]
     return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
 
 
-@kernel()
+@subkernel()
 def _compute_hessians(exact, batch):  # type: ignore[no-untyped-def]
     """Store the Hessians of a batch in its rows 37 to 87, for triangles with all angles up to 45°."""
     for number in range(BATCH):

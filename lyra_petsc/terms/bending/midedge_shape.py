@@ -33,7 +33,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import inlined, kernel
+from lyra_petsc.kernels.element import inlined, kernel, subkernel
 from lyra_petsc.kernels.vector3 import cross, dot, minus, point, scaled
 
 EXTENSION = 0.75 * math.pi
@@ -209,7 +209,7 @@ def _height_and_side(d, e, normal):  # type: ignore[no-untyped-def]
     return dot(d, normal), dot(d, cross(e, normal)) / math.sqrt(dot(e, e))
 
 
-@kernel()
+@subkernel()
 def _extended_tangent(side, height):  # type: ignore[no-untyped-def]
     """T of an angle beyond 45°."""
     if side == 0.0 and height == 0.0:
@@ -233,7 +233,7 @@ def derivatives_below_45(t):  # type: ignore[no-untyped-def]
     return slope, bend, t, slope, bend
 
 
-@kernel()
+@subkernel()
 def _extended_derivatives(t):  # type: ignore[no-untyped-def]
     """T', T'', S, S' and S'' at the angle with T = t, beyond 45°."""
     x = 0.5 * (abs(t) - 1.0)
@@ -280,7 +280,7 @@ def load(batch, row, i):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel()
+@subkernel()
 def load_edges(x, stencil, first, batch):  # type: ignore[no-untyped-def]
     """Store the edges e_i of triangles from ``first`` on in rows 0 to 8 of a batch.
 
@@ -305,7 +305,7 @@ def _without_rest_angle(director, edges, rest_rotation, e, i, edge):  # type: ig
     return c * d[0] + s * side[0], c * d[1] + s * side[1], c * d[2] + s * side[2]
 
 
-@kernel()
+@subkernel()
 def _load_directors(edges, director, rest_rotation, first, batch):  # type: ignore[no-untyped-def]
     """Store the directors of the edges in rows 0 to 8 of a batch in rows 9 to 17."""
     last = edges.shape[0] - 1

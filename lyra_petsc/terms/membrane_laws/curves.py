@@ -14,7 +14,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import inlined, kernel
+from lyra_petsc.kernels.element import inlined, kernel, subkernel
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.scene.materials.measured_curves import interpolation
 from lyra_petsc.terms.membrane_laws import compression
@@ -22,7 +22,7 @@ from lyra_petsc.terms.membrane_laws import compression
 SOFTENS = False
 
 
-@kernel()
+@subkernel()
 def _evaluate_curve(x, c, m, which):  # type: ignore[no-untyped-def]
     """Integral, value and slope at x of curve ``which`` (0 warp, 1 weft, 2 shear) of material m."""
     first, last = Index(c[m, 1 + which]), Index(c[m, 2 + which]) - Index(4)
@@ -49,7 +49,7 @@ def _evaluate_curve(x, c, m, which):  # type: ignore[no-untyped-def]
     return total, y0 + t * (d0 + t * (a + t * b)), (d0 + t * (2.0 * a + 3.0 * t * b)) / h
 
 
-@kernel()
+@subkernel()
 def _axial(e, c, m, which):  # type: ignore[no-untyped-def]
     """Energy, P/λ and its derivative at the Green strain e along warp (0) or weft (1)."""
     square = max(1.0 + 2.0 * e, compression.SMALLEST_SQUARE)
