@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.cli.progress import ProgressBar, closing_table
 from lyra_petsc.cli.signals import StopRequest
+from lyra_petsc.kernels.ahead import CompilationAhead
 from lyra_petsc.kernels.compilation import COMPILATION, no_action
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.run_folder import choose_folder
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from lyra_petsc.show.view.live import LivePage
 
 
-COMPILING_TAKES = "about 15 s, or half to one and a half minutes with contact or midedge"
+COMPILING_TAKES = "about 5 s, or up to half a minute with contact or midedge"
 NO_CACHE = "no folder for them can be written; NUMBA_CACHE_DIR names another"
 
 
@@ -95,6 +96,7 @@ class TerminalProgress(ProgressCallbacks):
         self._comm, self._usual = comm, usual
         self._progress: ProgressBar | None = None
         self._noted_cache = False
+        COMPILATION.ahead = CompilationAhead(comm.rank, comm.size)
         if comm.rank == 0:
             COMPILATION.first = self._announce_compilation
         self._served = served if comm.rank == 0 else None
@@ -148,7 +150,7 @@ class TerminalProgress(ProgressCallbacks):
 
     def close(self) -> None:
         """Leave the terminal as it was, end the page, and say how to view the run again."""
-        COMPILATION.first = no_action
+        COMPILATION.first = COMPILATION.ahead = no_action
         if self._progress is not None:
             self._progress.close()
         if self._page is not None:

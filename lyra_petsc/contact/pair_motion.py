@@ -22,7 +22,7 @@ from lyra_petsc.contact.pair_distances import (
     signed_distance,
 )
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel, leaf
+from lyra_petsc.kernels.element import kernel
 
 CCD_TOLERANCE = 0.1
 """Part of the distance to be covered up to the minimum distance at which continuous collision detection

@@ -22,6 +22,8 @@ class Compilation(event.Listener):
         Called when numba starts and ends a compilation; not for a kernel that another one calls.
     first : callable
         Called once, at the first compilation.
+    ahead : callable
+        Called when numba starts to compile, unless the result cannot be stored; may compile other kernels.
     all_cached : bool
         Whether all kernels could be stored on disk.
     """
@@ -30,6 +32,7 @@ class Compilation(event.Listener):
         self.begins: Callable[[], None] = no_action
         self.ends: Callable[[], None] = no_action
         self.first: Callable[[], None] = no_action
+        self.ahead: Callable[[], None] = no_action
         self.all_cached = True
         self._done = self._since = 0.0
         self._depth = 0
@@ -51,6 +54,8 @@ class Compilation(event.Listener):
             self.begins()
             first, self.first = self.first, no_action
             first()
+            if self.all_cached:
+                self.ahead()
 
     def on_end(self, event: event.Event) -> None:
         """Numba has compiled a kernel."""
