@@ -213,7 +213,7 @@ def judge_gain(record: RunRecord) -> Verdict:
 
 def judge_run(record: RunRecord) -> Verdict:
     """Whether the whole run gains no energy and, if semi-implicit, does not lose most of it."""
-    gained, dissipation = (float(record.balance[f"numerical_{what}"]) for what in ("gain", "dissipation"))
+    gained, dissipation = float(record.balance["numerical_gain"]), record.dissipation
     net = gained - dissipation
     text = (
         f"{100.0 * dissipation:.2g} % of the largest energy at work lost to the integrator, "

@@ -642,9 +642,10 @@ class StudyRunner:
         else:
             return Reference("none", "no reference: every attempt at one failed", notes=notes)
         folder, time = self.folder / CASES / finest.name, best.timings[0].run
-        found = Reference("finer", f"finer run: {finest.title}", None, folder, best.sheets, notes, {}, time)
-        found.own_errors = yield from self._estimate_errors(chains, found)
-        return found
+        title = f"finer run: {finest.title}"
+        reference = Reference("finer", title, None, folder, best.sheets, notes, {}, time)
+        reference.own_errors = yield from self._estimate_errors(chains, reference)
+        return reference
 
     def _chains(self, physics: Physics, smallest: float | None, integrator: str) -> list[Chain]:
         number = f"-{list(self.planned).index(physics) + 1}" if len(self.planned) > 1 else ""

@@ -113,9 +113,9 @@ def test_the_breathing_triangle_conserves_energy_and_has_the_right_extremes(
 
 @pytest.mark.parametrize("name", list(SOLUTIONS))
 def test_the_exact_motion_of_a_scene_is_found(name: str, tmp_path: Path) -> None:
-    found = matching(Body(scene_of(content(name, tmp_path))))
-    assert found is not None
-    assert found.name == name
+    solution = matching(Body(scene_of(content(name, tmp_path))))
+    assert solution is not None
+    assert solution.name == name
 
 
 @pytest.mark.parametrize("name", list(SOLUTIONS))

@@ -46,9 +46,9 @@ def test_the_cantilever_reproduces_b(comm: MPI.Comm) -> None:
     with Bench(comm) as bench:
         record = textile_tests.cantilever(bench, bias, 90.0)
     assert record.verdicts["B"].passed, record.verdicts
-    found = {number.quantity: number.value for number in record.numbers}
-    assert found["B"] == pytest.approx(5.0, rel=5e-3)  # µN·m, of the weft
-    assert found["overhang"] == pytest.approx(2.0 * found["bending length c"])
+    numbers = {number.quantity: number.value for number in record.numbers}
+    assert numbers["B"] == pytest.approx(5.0, rel=5e-3)  # µN·m, of the weft
+    assert numbers["overhang"] == pytest.approx(2.0 * numbers["bending length c"])
 
 
 def test_bending_reproduces_b_and_2hb() -> None:
@@ -80,11 +80,11 @@ def test_tension_reproduces_a_curve() -> None:
     law = {"warp": [[0.1, 50.0]], "weft": curve, "shear": [[0.1, 5.0]]}
     soft = Fabric("soft", {"density": 0.2, "bending": 1e-5, "bending_model": "midedge", "law": law})
     with Bench(MPI.COMM_SELF) as bench:
-        found = textile_tests.tensile(bench, soft, 90.0)
-    assert found.curves[0].y[-1] >= 500.0
+        record = textile_tests.tensile(bench, soft, 90.0)
+    assert record.curves[0].y[-1] >= 500.0
     points = tuple((0.0 + x, 0.0 + y) for x, y in [(0.0, 0.0), *curve])
-    forces = [force_at(points, x / 100.0) / 0.980665 for x in found.curves[0].x]
-    assert found.curves[0].y == pytest.approx(forces, rel=1e-9)
+    forces = [force_at(points, x / 100.0) / 0.980665 for x in record.curves[0].x]
+    assert record.curves[0].y == pytest.approx(forces, rel=1e-9)
     assert [force_at(points, x) for x, _ in points] == pytest.approx([y for _, y in points])
 
 
@@ -138,7 +138,7 @@ def test_a_loop_that_friction_holds_is_measured() -> None:
 
 
 def test_a_failed_formula_fails_its_test_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*given: Any) -> Record:
+    def fails(*arguments: Any) -> Record:
         raise ArithmeticError("the heart loop's elastica was not found")
 
     monkeypatch.setitem(TESTS, "loop", replace(TESTS["loop"], measure=fails))

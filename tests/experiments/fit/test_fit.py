@@ -90,9 +90,9 @@ def test_a_fit_finds_the_stiffness(kind: str, tmp_path: Path) -> None:
 def test_drape_is_the_area_of_the_shadow() -> None:
     content = STRIP | {"gravity": None, "handles": [{"nodes": [0, 1, 9, 10]}]}
     drape = {"drape": {"radius": 0.03, "support": 0.01}}
-    found = lyra_petsc.gradient(content, drape, ["material.bending"])
+    coefficient = lyra_petsc.gradient(content, drape, ["material.bending"])
     area, inner, outer = 0.08 * 0.02, np.pi * 1e-4, np.pi * 9e-4
-    assert found.value[0] == pytest.approx((area - inner) / (outer - inner), rel=1e-9)
+    assert coefficient.value[0] == pytest.approx((area - inner) / (outer - inner), rel=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["brgn", "blmvm"])
@@ -110,9 +110,9 @@ def test_search_and_conclusion(kind: str) -> None:
     deviation = np.sqrt(np.diag(covariance))
     assert words.startswith("the search ended")
     assert (np.abs(best.numbers - exact) < 0.3 * deviation).all()
-    found = conclude(unknowns, best)
-    assert [e.deviation for e in found.estimates] == pytest.approx(deviation)
-    assert found.correlation[0, 1] == pytest.approx(covariance[0, 1] / deviation[0] / deviation[1])
+    conclusion = conclude(unknowns, best)
+    assert [e.deviation for e in conclusion.estimates] == pytest.approx(deviation)
+    assert conclusion.correlation[0, 1] == pytest.approx(covariance[0, 1] / deviation[0] / deviation[1])
 
 
 def test_a_search_ends_at_a_jump() -> None:
@@ -120,18 +120,18 @@ def test_a_search_ends_at_a_jump() -> None:
     rng = np.random.default_rng(5)
     matrix, right = rng.standard_normal((40, 2)), rng.standard_normal(40)
     best = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    matrix, right, made = np.vstack([matrix, [0.0, 0.0]]), np.append(right, 0.0), []
+    matrix, right, tried = np.vstack([matrix, [0.0, 0.0]]), np.append(right, 0.0), []
 
     def jumps(numbers: np.ndarray) -> Misfit:
-        made.append(numbers)
+        tried.append(numbers)
         missed = matrix @ numbers - right
         missed[-1] = 9.0 * (numbers[0] > best[0] - 0.04)
         return Misfit(numbers, missed, matrix)
 
-    found, words = search([Unknown("a", best[0] - 0.1, -9.0, 9.0), Unknown("b", best[1], -9.0, 9.0)], jumps)
+    end, words = search([Unknown("a", best[0] - 0.1, -9.0, 9.0), Unknown("b", best[1], -9.0, 9.0)], jumps)
     assert words.startswith("the search ended")
-    assert best[0] - 0.1 < found.numbers[0] <= best[0] - 0.04
-    assert len(made) < 40
+    assert best[0] - 0.1 < end.numbers[0] <= best[0] - 0.04
+    assert len(tried) < 40
 
 
 def test_a_parameter_at_its_bound_and_undetermined_parameters() -> None:
@@ -139,11 +139,11 @@ def test_a_parameter_at_its_bound_and_undetermined_parameters() -> None:
     right = np.array([1.0, 2.0, 5.0, 10.0])
     unknowns = [Unknown("a", 0.2, -10.0, 10.0), Unknown("b", 0.3, -10.0, 10.0), Unknown("c", 1.0, 0.0, 2.0)]
     best, _ = search(unknowns, lambda p: Misfit(p, matrix @ p - right, matrix))
-    found = conclude(unknowns, best)
-    text = " ".join(found.notes)
+    conclusion = conclude(unknowns, best)
+    text = " ".join(conclusion.notes)
     assert "the data cannot tell a and b apart" in text
-    assert found.estimates[2].at_bound
-    assert found.estimates[2].value == pytest.approx(2.0)
+    assert conclusion.estimates[2].at_bound
+    assert conclusion.estimates[2].value == pytest.approx(2.0)
     assert "c is at its bound 2" in text
 
 
@@ -156,10 +156,10 @@ def test_a_fit_resumes_without_repeating(tmp_path: Path) -> None:
                 raise KeyboardInterrupt
 
     class Counts(FitObserver):
-        made = resumed = 0
+        evaluations = resumed = 0
 
         def evaluated(self, number: int, evaluation: Misfit, *, resumed: bool) -> None:
-            self.made, self.resumed = self.made + (not resumed), self.resumed + resumed
+            self.evaluations, self.resumed = self.evaluations + (not resumed), self.resumed + resumed
 
     comm = MPI.COMM_SELF
     with pytest.raises(KeyboardInterrupt):
@@ -265,10 +265,10 @@ def test_invalid_gradients_are_refused(scene: Any, quantity: Any, parameters: An
 def test_gradient_of_a_table_of_points(tmp_path: Path) -> None:
     """At all its times; tables without measured values have no uncertainty."""
     (tmp_path / "points.csv").write_text("time,probe,z\n0.5,tip,0\n1,tip,0\n")
-    found = lyra_petsc.gradient(STRIP, {"points": str(tmp_path / "points.csv")}, BENDING_KEY)
+    gradient = lyra_petsc.gradient(STRIP, {"points": str(tmp_path / "points.csv")}, BENDING_KEY)
     once = lyra_petsc.gradient(STRIP, {"probe": "tip", "axes": ["z"]}, BENDING_KEY)
-    assert found.value[1] == pytest.approx(once.value[0], rel=1e-4)
-    assert 0.0 > found.value[0] > found.value[1]
+    assert gradient.value[1] == pytest.approx(once.value[0], rel=1e-4)
+    assert 0.0 > gradient.value[0] > gradient.value[1]
 
 
 def test_values_are_in_the_order_of_their_axes() -> None:
@@ -306,7 +306,7 @@ def elastica(stiffness: float, weight: float, length: float, s: np.ndarray) -> n
         )
 
     lowest = -weight * length**2 / stiffness
-    curvature = brentq(lambda each: shot(each).y[1, -1], lowest, 0.0)
+    curvature = brentq(lambda start: shot(start).y[1, -1], lowest, 0.0)
     return np.asarray(shot(curvature).sol(s)[2:].T)
 
 
@@ -380,8 +380,8 @@ def test_contact_by_differences() -> None:
         "obstacles": {"floor": {"plane": {"point": [0, 0, -0.02], "normal": [0, 0, 1]}}},
         "time": {"end": 0.04, "step": 0.02},
     }
-    found = lyra_petsc.gradient(content, {"probe": "tip", "axes": ["z"]}, ["material.density"])
-    assert np.isfinite(found.derivatives["material.density"]).all()
+    gradient = lyra_petsc.gradient(content, {"probe": "tip", "axes": ["z"]}, ["material.density"])
+    assert np.isfinite(gradient.derivatives["material.density"]).all()
 
 
 def test_report(tmp_path: Path) -> None:

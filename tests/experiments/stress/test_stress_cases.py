@@ -45,12 +45,12 @@ def scene(tmp_path: Path) -> Path:
 
 
 def test_names_are_unique_and_cases_have_titles() -> None:
-    found = FAMILIES.all()
-    assert [family.name for family in found] == list(FAMILIES.entries)
-    names = [case.name for family in found for case in family.cases]
+    families = FAMILIES.all()
+    assert [family.name for family in families] == list(FAMILIES.entries)
+    names = [case.name for family in families for case in family.cases]
     assert len(names) == len(set(names))
     assert not set(names) & set(FAMILIES.entries)
-    assert all(family.title and all(case.title for case in family.cases) for family in found)
+    assert all(family.title and all(case.title for case in family.cases) for family in families)
 
 
 def test_levels_are_nested_and_the_usual_one_has_every_family() -> None:
@@ -78,10 +78,10 @@ def test_an_unknown_name_is_refused(name: str) -> None:
         selected([name], Scope.QUICK)
 
 
-@pytest.mark.parametrize("given", [False, True])
-def test_every_case_is_a_scene(comm: MPI.Comm, scene: Path, given: bool) -> None:
-    setting = setting_of(scene if given else None, (), Scope.QUICK)
-    made, left_out = 0, []
+@pytest.mark.parametrize("of_user", [False, True])
+def test_every_case_is_a_scene(comm: MPI.Comm, scene: Path, of_user: bool) -> None:
+    setting = setting_of(scene if of_user else None, (), Scope.QUICK)
+    count, left_out = 0, []
     with Bench(comm, direct=False) as bench:
         for case in selected([], Scope.FULL):
             try:
@@ -93,10 +93,10 @@ def test_every_case_is_a_scene(comm: MPI.Comm, scene: Path, given: bool) -> None
             assert checked.time.end == pytest.approx(case.steps * float(checked.time.step))
             assert checked.solver == Scene.model_validate(setting.base).solver
             assert checked.petsc == {}
-            made += 1
-    assert setting.base == setting_of(scene if given else None, (), Scope.QUICK).base
-    assert made > 200
-    assert bool(left_out) is given
+            count += 1
+    assert setting.base == setting_of(scene if of_user else None, (), Scope.QUICK).base
+    assert count > 200
+    assert bool(left_out) is of_user
 
 
 def test_a_given_scene_keeps_its_materials_and_mesh(scene: Path) -> None:

@@ -36,8 +36,8 @@ def record(balance: StepBalance = GOOD, report: StepReport = STEP, **more: objec
     return replace(good, **more)  # type: ignore[arg-type]
 
 
-def failures(found: RunRecord) -> dict[str, str]:
-    return {name: verdict.message for name, verdict in judge_physics(found).items() if not verdict.passed}
+def failures(run: RunRecord) -> dict[str, str]:
+    return {name: verdict.message for name, verdict in judge_physics(run).items() if not verdict.passed}
 
 
 def test_a_good_record_passes() -> None:
@@ -83,8 +83,8 @@ def test_each_violated_balance_fails_its_verdict(change: dict[str, Any], name: s
 @pytest.mark.parametrize(("left", "good"), [(0.9e-4, True), (1.1e-4, False), (math.nan, False)])
 def test_large_residuals_at_round_off_are_allowed_if_they_move_nothing(left: float, good: bool) -> None:
     stiff = replace(GOOD, residual=1e-6, driving=1e-6, promised=1e-9, floor=2e-6)
-    found = failures(record(stiff, replace(STEP, remaining=left)))
-    assert ("resolved" in found) is not good
+    messages = failures(record(stiff, replace(STEP, remaining=left)))
+    assert ("resolved" in messages) is not good
 
 
 def test_a_gain_is_allowed_where_the_energy_is_not_convex() -> None:
@@ -152,8 +152,8 @@ def test_the_whole_run_is_judged(
     integrator: str, dissipation: float, gained: float, good: bool, word: str
 ) -> None:
     balance = {"numerical_dissipation": dissipation, "numerical_gain": gained, "repeated": 2}
-    found = replace(record(integrator=integrator), balance=balance)
-    verdicts = judge_physics(found)
+    run = replace(record(integrator=integrator), balance=balance)
+    verdicts = judge_physics(run)
     assert verdicts["whole run"].passed is good
     assert "2 attempts repeated" in verdicts["whole run"].message
-    assert StressOutcome(StressCase("a", "b", base_scene), verdicts, record=found).verdict == word
+    assert StressOutcome(StressCase("a", "b", base_scene), verdicts, record=run).verdict == word

@@ -155,10 +155,10 @@ def test_failed_rows_are_omitted() -> None:
 @pytest.mark.parametrize("order", [1, 2])
 def test_richardson_finds_the_error_of_a_converging_sequence(order: int) -> None:
     value = [1.0 + 0.3 * h**order for h in (0.1, 0.2, 0.4)]
-    found = richardson(abs(value[0] - value[1]), abs(value[1] - value[2]), order)
-    assert found.error == pytest.approx(value[0] - 1.0)
-    assert found.order == pytest.approx(order)
-    assert found.trusted
+    estimate = richardson(abs(value[0] - value[1]), abs(value[1] - value[2]), order)
+    assert estimate.error == pytest.approx(value[0] - 1.0)
+    assert estimate.order == pytest.approx(order)
+    assert estimate.trusted
 
 
 def test_richardson_limits_the_order_and_refuses_divergence() -> None:
@@ -184,8 +184,8 @@ def test_a_largest_error_that_changes_place_is_not_underestimated() -> None:
     """One vertex has the largest difference of the coarser runs, another that of the finer runs."""
     first, second = np.array([0.75, 0.45]), np.array([6.0, 1.2])  # at two samples
     chain = Chain((), 2)
-    found = estimate_chain([{"position_max": first}, {"position_max": second}], chain)["position_max"].error
+    largest = estimate_chain([{"position_max": first}, {"position_max": second}], chain)["position_max"].error
     slowest = first[1] / (second[1] / first[1] - 1.0)  # the second sample converges slowly
-    assert found >= 1.25 * slowest
+    assert largest >= 1.25 * slowest
     whole = estimate_chain([{"position_l2": first}, {"position_l2": second}], chain)["position_l2"].error
-    assert whole < found
+    assert whole < largest

@@ -61,10 +61,10 @@ def test_invalid_axes_are_refused(texts: list[str], words: str) -> None:
 
 
 def test_combinations_vary_the_last_axis_fastest() -> None:
-    found = make_combinations(parse_axes(["integrator=beuler,bdf2", "dt=0.02,0.01"]))
-    assert [c.name for c in found] == ["beuler-dt0.02", "beuler-dt0.01", "bdf2-dt0.02", "bdf2-dt0.01"]
-    assert found[3].title == "bdf2, Δt 10 ms"
-    assert found[3].settings == {"integrator": "bdf2", "dt": 0.01}
+    combinations = make_combinations(parse_axes(["integrator=beuler,bdf2", "dt=0.02,0.01"]))
+    assert [c.name for c in combinations] == ["beuler-dt0.02", "beuler-dt0.01", "bdf2-dt0.02", "bdf2-dt0.01"]
+    assert combinations[3].title == "bdf2, Δt 10 ms"
+    assert combinations[3].settings == {"integrator": "bdf2", "dt": 0.01}
 
 
 def test_names_are_unique_file_names() -> None:

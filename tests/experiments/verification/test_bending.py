@@ -33,8 +33,8 @@ PUBLISHED = reference("cantilevers")
 def test_the_loaded_elastica_agrees_with_the_published_one(row: list[float]) -> None:
     load, angle, shortening, drop = row
     tip = cantilever(0.0, tip_load=load)
-    found = (tip.angle, 1.0 - tip.reach, tip.drop)
-    assert found == pytest.approx((angle, shortening, drop), abs=PUBLISHED["tip_load"]["tolerance"])
+    shape = (tip.angle, 1.0 - tip.reach, tip.drop)
+    assert shape == pytest.approx((angle, shortening, drop), abs=PUBLISHED["tip_load"]["tolerance"])
 
 
 @pytest.mark.parametrize("row", PUBLISHED["own_weight"]["rows"], ids=lambda row: f"{row[0]:g}")
@@ -98,8 +98,8 @@ def test_bending_over_the_factor_of_the_mesh_gives_b(comm: MPI.Comm, pattern: st
     )
     with Bench(comm).simulation(scene) as trial:
         hinges, points = hinges_of(trial), trial.x[:, :2]
-    found = strip_stiffness(hinges, points, start=0.25, period=0.25, width=0.125)
-    assert found == pytest.approx(1.0, rel=1e-10)
+    stiffness = strip_stiffness(hinges, points, start=0.25, period=0.25, width=0.125)
+    assert stiffness == pytest.approx(1.0, rel=1e-10)
 
 
 @pytest.mark.parallel(2)

@@ -35,8 +35,8 @@ def test_stress_and_energy_agree_with_the_table() -> None:
     tables = reference("stvk_patch")
     for material, _, gradient, _, stress, _, energy in tables["rows"]:
         c = dict(zip(("c11", "c12", "c22", "c33"), tables["materials"][material], strict=True))
-        found, stored = answer(np.array(gradient), c)
-        np.testing.assert_allclose(found, stress, rtol=1e-9, atol=1e-9)
+        computed, stored = answer(np.array(gradient), c)
+        np.testing.assert_allclose(computed, stress, rtol=1e-9, atol=1e-9)
         assert stored == pytest.approx(energy, rel=1e-9, abs=1e-9)
 
 

@@ -45,9 +45,9 @@ def test_frequencies_agree_with_a_dense_solver(comm: MPI.Comm, count: int) -> No
     with Bench(MPI.COMM_SELF) as bench, bench.simulation(SHEET) as trial:
         exact = np.sqrt(dense(trial)[:count])
     with Bench(comm) as bench, bench.simulation(SHEET) as trial:
-        found, shapes = lowest_modes(trial, count)
+        frequencies, shapes = lowest_modes(trial, count)
         mass = trial.mass
-    np.testing.assert_allclose(found, exact, rtol=1e-9)
+    np.testing.assert_allclose(frequencies, exact, rtol=1e-9)
     inertia = np.einsum("avi,v,bvi->ab", shapes, mass, shapes)
     np.testing.assert_allclose(inertia, np.eye(count), rtol=0.0, atol=1e-9)
     assert np.abs(shapes[:, [0, 5, 10, 15]]).max() == 0.0  # the held edge

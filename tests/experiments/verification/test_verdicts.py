@@ -78,7 +78,7 @@ def test_the_bound_of_a_quick_run_grows_with_h() -> None:
     assert not Claim(within=1e-3, growth=1.0).judge(rows, finest(rows) / 4.0).passed
 
 
-def made(**changes: object) -> VerificationCase:
+def sample_case(**changes: object) -> VerificationCase:
     def measure(bench: Bench, n: float) -> Iterable[Measured]:
         return [Measured("a", 1.0 + n**-2, 1.0, "m"), Measured("b", 2.0, 2.0)]
 
@@ -89,13 +89,13 @@ def made(**changes: object) -> VerificationCase:
 
 @pytest.mark.parallel(2)
 def test_rows_and_verdicts_of_a_case(comm: MPI.Comm) -> None:
-    outcome = run_case(comm, made())
+    outcome = run_case(comm, sample_case())
     assert outcome.passed
     assert list(outcome.tables()) == ["a", "b"]
     assert [r.n for r in outcome.tables()["a"]] == [4, 8, 16]
     assert [r.order for r in outcome.tables()["a"]][1:] == pytest.approx([2.0, 2.0])
     assert all(math.isnan(r.order) for r in outcome.tables()["b"])
-    assert [r.n for r in run_case(comm, made(), quick=True).tables()["a"]] == [4, 8]
+    assert [r.n for r in run_case(comm, sample_case(), quick=True).tables()["a"]] == [4, 8]
 
 
 @pytest.mark.parallel(2)
@@ -107,7 +107,7 @@ def test_a_case_that_cannot_run_is_reported_and_the_others_continue(comm: MPI.Co
         if n == 16:
             raise InputError("is not there", key="some.key")
 
-    outcome = run_case(comm, made(measure=measure))
+    outcome = run_case(comm, sample_case(measure=measure))
     assert not outcome.passed
     assert outcome.verdicts["a"].passed  # order 2 between 4 and 16
     assert [r.n for r in outcome.tables()["a"]] == [4, 16]
@@ -121,7 +121,7 @@ def test_a_case_that_cannot_run_is_reported_and_the_others_continue(comm: MPI.Co
 
 @pytest.mark.parallel(2)
 def test_a_case_without_measurements_fails(comm: MPI.Comm) -> None:
-    assert not run_case(comm, made(measure=lambda bench, n: [])).passed
+    assert not run_case(comm, sample_case(measure=lambda bench, n: [])).passed
 
 
 @pytest.mark.parallel(2)
