@@ -310,8 +310,8 @@ def launch(launcher: Launcher, job: Job, watch: Callable[[], None], lock: int) -
     """
     folder = Path(job.folder)
     job_file = folder.with_name(f"{folder.name}.job.json")
-    with writing(folder):
-        make_folder(folder)
+    with writing(folder.parent):
+        make_folder(folder.parent)
     save_record(job_file, job)
     try:
         _, message = launcher(["--job", str(job_file)], watch, (lock,))
