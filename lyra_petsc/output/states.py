@@ -242,7 +242,7 @@ class StateWriter:
         self._document.replace(map(self._series.grid, keep))
         if self._vtkhdf:
             self._write_vtkhdf(keep)
-        stale = [] if self._vtkhdf else [self.folder / VTKHDF_FILE, self.folder / CELLS_FILE]
+        unwanted = [] if self._vtkhdf else [self.folder / VTKHDF_FILE, self.folder / CELLS_FILE]
         kept = {state.file for state in keep}
         try:
             for path in state_files(self.folder):
@@ -252,7 +252,7 @@ class StateWriter:
                     with rows_writable(path) as file:
                         steps = file[TABLE]["step"]
                         steps[...] = np.where(steps[...] > last_step, -1, steps[...])
-            for path in stale:
+            for path in unwanted:
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(f"{self.folder}: a later state cannot be removed: {reason(error)}") from error

@@ -77,14 +77,10 @@ def with_one(value: float) -> Callable[[Any], Any]:
 
 DAMAGES: dict[str, Callable[[Any, str], None]] = {
     "missing": delete,
-    "big-endian": replaced(lambda x: x.astype(">f8")),
     "whole": replaced(lambda x: x.astype("<i8")),
-    "text": replaced(b"text"),
-    "scalar": replaced(1.0),
     "nan": replaced(with_one(np.nan)),
     "huge": replaced(with_one(1e300)),
     "fewer": replaced(lambda x: x[:-1]),
-    "deeper": replaced(lambda x: x[..., None]),
     "endless": lengthen,
 }
 OF_NUMBERS = {

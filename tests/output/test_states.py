@@ -26,10 +26,8 @@ REST = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [2, 0, 0]], dtype=f
 TRIANGLES = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]])
 
 
-def strip(seam: float = 0.0) -> Mesh:
-    uv = REST[TRIANGLES][..., :2].copy()
-    uv[1] += seam
-    return Mesh(REST + 1.0, REST, TRIANGLES, uv, np.ones(3, dtype=bool))
+def strip() -> Mesh:
+    return Mesh(REST + 1.0, REST, TRIANGLES, REST[TRIANGLES][..., :2], np.ones(3, dtype=bool))
 
 
 class Run:
@@ -258,19 +256,3 @@ def test_more_than_9999_states(comm, shared_tmp, run):
     assert resumed.writer._next == 10001
     resumed.write(3)
     on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.1, 0.2, 0.3]))
-
-
-def test_material_coordinates_are_those_of_vertices_unless_there_are_seams(comm, shared_tmp):
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-
-    def check(**expected):
-        with h5py.File(shared_tmp / "mesh.h5", "r") as file:
-            found = {name: data[()] for name, data in file["mesh"].items()}
-        assert found.keys() == expected.keys()
-        for name, values in expected.items():
-            np.testing.assert_array_equal(found[name], values)
-
-    on_first(comm, lambda: check(triangles=TRIANGLES, rest=REST, uv=REST[:, :2]))
-    write_mesh(shared_tmp, strip(seam=10.0) if comm.rank == 0 else None, comm)
-    corners = strip(seam=10.0).triangle_uv
-    on_first(comm, lambda: check(triangles=TRIANGLES, rest=REST, corner_uv=corners))

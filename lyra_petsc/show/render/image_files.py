@@ -24,7 +24,8 @@ TILES = 6
 """Pictures on a contact sheet."""
 GAP = 4
 """Pixels between the pictures."""
-MAX_TEXTURE_PIXELS = 4096
+MIN_PIXELS, MAX_PIXELS = 32, 8192
+"""Limits of the width and height of pictures [pixels]."""
 
 PALETTE = (
     "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=sierra2_4a:diff_mode=rectangle"
@@ -170,7 +171,7 @@ def film_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Calla
 
 
 def read_texture(path: Path) -> Image:
-    """(h, w, 3) picture from a file, scaled down to at most 4096 pixels in each direction.
+    """(h, w, 3) picture from a file, scaled down to at most `MAX_PIXELS` in each direction.
 
     Raises
     ------
@@ -182,7 +183,7 @@ def read_texture(path: Path) -> Image:
 
     try:
         with Pictures.open(path) as picture:
-            picture.thumbnail((MAX_TEXTURE_PIXELS, MAX_TEXTURE_PIXELS))
+            picture.thumbnail((MAX_PIXELS, MAX_PIXELS))
             return np.asarray(picture.convert("RGB"))
     except UnidentifiedImageError:
         raise InputError("is not a picture (PNG, JPEG, …)", file=path, key="--texture") from None

@@ -19,7 +19,14 @@ from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.show.render.camera import line_of_sight, up_direction
 from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
-from lyra_petsc.show.render.image_files import TILES, check_film, parse_colors, read_texture
+from lyra_petsc.show.render.image_files import (
+    MAX_PIXELS,
+    MIN_PIXELS,
+    TILES,
+    check_film,
+    parse_colors,
+    read_texture,
+)
 from lyra_petsc.show.render.opengl import check_opengl
 from lyra_petsc.show.render.sheet_geometry import HeldVertices, sheet_numbers
 
@@ -27,8 +34,6 @@ PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
 """Packages of the extra ``view`` that pictures need."""
 
 SIZE = "1280x720"
-MIN_PIXELS, MAX_PIXELS = 32, 8192
-"""Limits of a picture's width and height [pixels]."""
 COLORS = ("#c8402f", "#f0e2c8")
 """Front and back of a single sheet."""
 SHEET_COLORS = (

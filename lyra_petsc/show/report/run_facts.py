@@ -110,11 +110,6 @@ class Facts:
         """Wall time [s] by phase since the last start or resumption; empty if the run is not finished."""
         return {} if self.run.outcome in ("running", "killed") else dict(self.summary.get("wall_seconds", {}))
 
-    def share(self, phase: str) -> float:
-        """Fraction of the wall time that a phase took."""
-        total = sum(self.phases.values())
-        return self.phases.get(phase, 0.0) / total if total else 0.0
-
 
 NOTABLE = 0.05
 """Rejected attempts over accepted steps, or lost energy over the largest change of one, to be mentioned."""

@@ -253,8 +253,9 @@ def _wall_time(page: Report, facts: Facts) -> None:
         )
         return
     page.figure(phases(wall))
+    total = max(sum(wall.values()), 1e-12)
     page.table(
-        ["phase", "wall time [s]", "share"], [[n, float(v), percent(facts.share(n))] for n, v in wall.items()]
+        ["phase", "wall time [s]", "share"], [[n, float(v), percent(v / total)] for n, v in wall.items()]
     )
     if facts.summary.get("resumed"):
         page.paragraph("Since the last resumption; the steps before are in the tables above.")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import imageio_ffmpeg
 import numpy as np
@@ -25,7 +24,7 @@ from lyra_petsc.show.render.draw import draw
 from lyra_petsc.show.render.image_files import film_writer
 from lyra_petsc.show.render.render_plan import RenderOptions, make_plan
 from lyra_petsc.show.render.scene_drawing import FLOOR_GAP, Bounds, floor_height, near_obstacle_points
-from lyra_petsc.show.render.sheet_geometry import sheet_numbers, split_at_seams, vertex_normals
+from lyra_petsc.show.render.sheet_geometry import split_at_seams, vertex_normals
 
 SIZE = "160x120"
 FRONT, BACK = "#ff0000", "#0000ff"
@@ -143,23 +142,6 @@ def test_colours_distinguish_values_and_have_a_bar(ring, tmp_path):
         return np.abs(np.diff(shown[row, first : pixel(2.7, 2.6)[1], 1])).max()
 
     assert jumps(means) < 0.6 * jumps(image)
-
-
-def test_the_bar_has_round_labels(ring, tmp_path, monkeypatch):
-    import pyvista
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    added, labels = pyvista.Plotter.add_scalar_bar, []
-
-    def keep(*args: object, **options: object) -> object:
-        labels.append(added(*args, **options))
-        return labels[-1]
-
-    monkeypatch.setattr(pyvista.Plotter, "add_scalar_bar", keep)
-    picture(ring, tmp_path, field="stress", range="0,6.12")
-    (bar,) = labels
-    assert bar.GetUseCustomLabels()
-    np.testing.assert_allclose(vtk_to_numpy(bar.GetCustomLabels()), [0, 2, 4, 6])
 
 
 def test_handles_and_label_are_drawn_on_request(tmp_path):
@@ -357,14 +339,6 @@ def test_a_single_picture_is_filled_by_its_state(ring, tmp_path, at):
     assert max(np.ptp(rows) / 120, np.ptp(columns) / 160) == pytest.approx(0.86, abs=0.02)
 
 
-def test_sheets_are_numbered_in_the_order_of_the_file():
-    """Five strips of two triangles, of which the second one has two triangles more."""
-    strips = np.arange(20).reshape(5, 4)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
-    triangles = np.concatenate([strips, [[5, 20, 6], [20, 21, 6]]])
-    run = SimpleNamespace(rest=np.random.default_rng(1).normal(size=(22, 3)), triangles=triangles)
-    np.testing.assert_array_equal(sheet_numbers(run), [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 1, 1])
-
-
 def test_each_sheet_has_its_own_colours(tmp_path):
     run, apart = written(tmp_path / "run", fields=False), [0, 4]
     mesh = ring_mesh()
@@ -396,16 +370,6 @@ def test_the_floor_is_below_what_stands_on_it(tmp_path, shape, lowest, shown):
     assert floor_height(surfaces, bounds, run.times) == pytest.approx(lowest)
     near = near_obstacle_points(surfaces, bounds, run.times, -np.eye(3))
     assert near[:, 2].min(initial=np.inf) == pytest.approx(shown)
-
-
-def test_a_ball_is_framed_by_its_surface(tmp_path):
-    """Not by the corners of its bounding box."""
-    ball = {"sphere": {"center": [1, 1, 1], "radius": 2}}
-    run = StoredRun(written_with_obstacles(tmp_path / "run", obstacles={"ball": ball}))
-    bounds = Bounds(np.eye(3), np.zeros(3), np.array([3.0, 3.0, 0.0]))
-    normals = np.array([[1, 1, 1], [0, 1, -1]]) / np.sqrt([[3], [2]])
-    near = near_obstacle_points(obstacle_surfaces(run, bounds.middle, 1.0), bounds, run.times, normals)
-    np.testing.assert_allclose((near @ normals.T).max(axis=0), [np.sqrt(3) + 2, 2], rtol=0.01)
 
 
 def test_a_run_without_the_mesh_of_an_obstacle_is_refused(tmp_path):
