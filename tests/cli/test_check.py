@@ -103,11 +103,9 @@ def test_mesh_scripts_are_guarded_and_trusted_on_request_only(tmp_path: Path) ->
     script.write_text('Include "../outside.geo";\n' + SQUARE)
     (tmp_path / "outside.geo").write_text("a = 1;\n")
     study = ["study", "scenes/scene.yaml", "--vary", "dt=0.01", "--set", "time.end=0.02", "--repeats", "1"]
-    stress = ["stress", "scenes/scene.yaml", "--quick", "--only", "gravity"]
     for words in (
         ["check", "scenes/scene.yaml"],
         ["new", "starter", "--mesh", "scenes/m.geo"],
-        stress,
         study,
     ):
         refused(words, tmp_path, "outside.geo")
