@@ -100,6 +100,35 @@ def test_names_of_classes_and_modules_occur_once() -> None:
     assert [name for name, count in names.items() if count > 1] == []
 
 
+OF_CONTACT = {
+    "SceneContact", "set_up_terms", "Barrier", "barrier", "RefusedDisplacement", "ContactModel", "NearPair",
+    "Overlaps", "behind_wall", "find_overlaps", "refuse_crossings", "have_common_vertex", "self_crossings",
+}  # fmt: skip
+"""All that other packages import from `lyra_petsc.contact`."""
+
+
+def test_contact_is_known_by_few_names_and_six_verbs() -> None:
+    names = set()
+    for path in MODULES:
+        if package_of(module_name(path)) != "contact":
+            for node in ast.walk(parsed(path)):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lyra_petsc.contact"):
+                    names |= {alias.name for alias in node.names}
+    assert names == OF_CONTACT
+    bodies = (
+        node.body
+        for node in parsed(PACKAGE / "contact" / "scene_contact.py").body
+        if isinstance(node, ast.ClassDef) and node.name == "SceneContact"
+    )
+    verbs = [
+        node.name
+        for body in bodies
+        for node in body
+        if isinstance(node, ast.FunctionDef) and not (node.name.startswith("_") or node.decorator_list)
+    ]
+    assert sorted(verbs) == ["begin", "finish", "follow", "limit", "report", "update"]
+
+
 def test_only_the_command_line_prints() -> None:
     for path in MODULES:
         if package_of(module_name(path)) in ("cli", "__main__"):

@@ -23,7 +23,7 @@ from lyra_petsc.contact.barrier_law import barrier as barrier_law
 from lyra_petsc.contact.barrier_pairs import barrier_pairs
 from lyra_petsc.contact.contact_search import ContactSearch
 from lyra_petsc.contact.contact_setup import HALFWAY_CURVATURE, Barrier, surface_elements
-from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles, StepInterval
+from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles
 from lyra_petsc.contact.one_sided import Springs
 from lyra_petsc.contact.pair_distances import EDGE_EDGE
 from lyra_petsc.contact.pairs import Contacts, NearPairs, chosen, no_near_pairs
@@ -43,9 +43,6 @@ TARGET_TOLERANCE = 0.05
 
 MAX_DEVIATION = 0.1
 """Largest deviation over the gap of an obstacle's paths from straight lines, where these are used instead."""
-
-
-TO_STAGE = StepInterval(0.0, 1.0)
 
 
 class ActivePairs(NamedTuple):
@@ -152,7 +149,7 @@ class ContactBarrier(LimitsStep):
     # -- obstacles ---------------------------------------------------------------------------------
 
     def freeze(self, step: UpcomingStep) -> ObstaclePositions:
-        return self.search.expect(step)
+        return self.obstacles.in_step(step.start, step.target_time, act=step.in_contact)
 
     @property
     def moving(self) -> bool:
@@ -165,6 +162,10 @@ class ContactBarrier(LimitsStep):
         if not self.n_elements:
             return NO_PAIRS
         return ActivePairs(*self._active_at(np.concatenate([x, obstacle_x])))
+
+    def _acting_pairs(self, x: Array, frozen: ObstaclePositions) -> ActivePairs:
+        """The pairs with forces in the equations of a step, at positions x (n_local, 3) [m] at its end."""
+        return self.active_pairs(x, frozen.end) if frozen.act else NO_PAIRS
 
     def _find_active(self, points: Array) -> tuple[NDArray[Any], ...]:
         x, obstacle_x = np.split(points, [len(points) - self.obstacles.n_points])
@@ -187,7 +188,7 @@ class ContactBarrier(LimitsStep):
     def energies(self, x: Array, frozen: ObstaclePositions) -> Array:
         if not self.n_elements:
             return _EMPTY
-        active = self.active_pairs(x, frozen.stage)
+        active = self._acting_pairs(x, frozen)
         counted = active.owned_weight != 0.0  # only owned pairs, which come first
         energies = (active.owned_weight * active.energy)[counted]
         return np.bincount(active.pair[counted], energies, minlength=self.n_owned).astype(np.float64)
@@ -195,8 +196,8 @@ class ContactBarrier(LimitsStep):
     def add_gradient(self, x: Array, frozen: ObstaclePositions, out: Array) -> None:
         if not self.n_elements:
             return
-        active, on_obstacles = self.active_pairs(x, frozen.stage).forces, np.zeros_like(frozen.stage)
-        contact_pairs.add_gradient(x, frozen.stage, *self._pair_data, active, out, on_obstacles)
+        active, on_obstacles = self._acting_pairs(x, frozen).forces, np.zeros_like(frozen.end)
+        contact_pairs.add_gradient(x, frozen.end, *self._pair_data, active, out, on_obstacles)
 
     def overrun(self, x: Array, frozen: ObstaclePositions) -> tuple[float, str]:
         return 0.0, ""
@@ -205,27 +206,27 @@ class ContactBarrier(LimitsStep):
         """Which pairs (E,) have a non-zero Hessian at positions x (n_local, 3), springs included."""
         out = np.zeros(self.n_elements, dtype=np.bool_)
         if self.n_elements:
-            out[self.active_pairs(x, frozen.stage).pair] = True
+            out[self._acting_pairs(x, frozen).pair] = True
             if self._springs is not None:
                 out[self._springs.pair] = True
         return out
 
     def add_hessian(self, x: Array, frozen: ObstaclePositions, into: Assembly) -> None:
-        pair, pair_weight, beta, derivatives = self.active_pairs(x, frozen.stage).forces
+        pair, pair_weight, beta, derivatives = self._acting_pairs(x, frozen).forces
         active = pair, into.weight[pair] * pair_weight, beta, derivatives
         to = into.convexity, into.offsets[self.name], into.values
-        contact_pairs.add_hessians(x, frozen.stage, *self._pair_data, active, *to)
+        contact_pairs.add_hessians(x, frozen.end, *self._pair_data, active, *to)
 
     def largest_stiffness(self, x: Array, frozen: ObstaclePositions) -> float:
         """Largest b″ [N/m] of an active pair times its weight on this rank."""
-        active = self.active_pairs(x, frozen.stage)
+        active = self._acting_pairs(x, frozen)
         return float((active.owned_weight * active.stiffness).max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:
         return HALFWAY_CURVATURE * self.pairs.stiffness * size
 
     def stiffness(self, x: Array, frozen: ObstaclePositions) -> Array:
-        active, out = self.active_pairs(x, frozen.stage), np.zeros(self.n_elements)
+        active, out = self._acting_pairs(x, frozen), np.zeros(self.n_elements)
         stiffness = np.maximum(active.weight, active.owned_weight) * active.stiffness
         out[active.pair] = np.maximum(stiffness, HALFWAY_CURVATURE * self.pairs.stiffness[active.pair])
         return out
@@ -238,25 +239,25 @@ class ContactBarrier(LimitsStep):
     def largest_step(self, x: Array, dx: Array, frozen: ObstaclePositions) -> float:
         if not self.n_elements:
             return 1.0
-        at_rest = np.zeros_like(frozen.stage)
+        at_rest = np.zeros_like(frozen.end)
         approach = pair_motion.largest_approach(dx, at_rest)
-        bound = self.active_pairs(x, frozen.stage).lower_bound
+        bound = self._acting_pairs(x, frozen).lower_bound
         near = np.flatnonzero(approach > (1.0 - KEPT_FRACTION) * bound)
         pairs = *(data[near] for data in self.pairs.geometry), KEPT_FRACTION, 1.0
-        return float(pair_motion.largest_step(x, frozen.stage, dx, at_rest, *pairs))
+        return float(pair_motion.largest_step(x, frozen.end, dx, at_rest, *pairs))
 
     def springs(self, x: Array, approach: float, frozen: ObstaclePositions) -> Springs:
         """One-sided springs for the pairs in contact at x (n_local, 3), or that may be after points have
         approached each other by ``approach`` [m], the same on all ranks. Their pairs count as active until
         `release_springs`.
         """
-        active, capacity = self.active_pairs(x, frozen.stage), self._capacity
+        active, capacity = self._acting_pairs(x, frozen), self._capacity
         of_active = active.pair, active.weight, active.owned_weight, active.beta, active.derivatives
         while True:
             integers = np.empty(capacity, dtype=np.int64)
             arrays = integers, np.empty((capacity, 4)), np.empty((capacity, 3)), *np.empty((3, capacity))
             pairs = *self._pair_data, of_active, self.n_owned
-            n_active, n = one_sided.find_springs(x, frozen.stage, approach, *pairs, arrays)
+            n_active, n = one_sided.find_springs(x, frozen.end, approach, *pairs, arrays)
             if n <= capacity:
                 break
             capacity = n
@@ -278,7 +279,7 @@ class ContactBarrier(LimitsStep):
         """Distances of pairs that `add_corrections` restores after Newton's increment dx (n_local, 3) [m]."""
         n, pairs = self.n_elements, (*self.pairs.geometry, TARGET_FRACTION, self._expected)
         targets = np.empty(n), np.zeros((n, 3)), np.empty(n, np.bool_)
-        pair_motion.target_distances(x, frozen.stage, dx, *pairs, *targets)
+        pair_motion.target_distances(x, frozen.end, dx, *pairs, *targets)
         return targets
 
     def add_corrections(
@@ -296,22 +297,18 @@ class ContactBarrier(LimitsStep):
         ``weight`` (n_local, 1).
         """
         pairs = *self.pairs.geometry, *targets, TARGET_TOLERANCE
-        return bool(pair_motion.add_corrections(x, frozen.stage, dx, *pairs, out, weight))
+        return bool(pair_motion.add_corrections(x, frozen.end, dx, *pairs, out, weight))
 
     # -- collisions --------------------------------------------------------------------------------
 
-    def is_collision_free(
-        self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval
-    ) -> bool:
-        """Whether nothing collides on the displacement dx (n_local, 3) [m] from x, while obstacles move as
-        in an interval of the step.
-        """
+    def is_collision_free(self, x: Array, dx: Array, frozen: ObstaclePositions) -> bool:
+        """Whether nothing collides on the displacement dx (n_local, 3) [m] from x, while obstacles move."""
         if not self.n_elements:
             return True
         curved = np.flatnonzero(self.search.path_deviations > MAX_DEVIATION * self.barrier.gap)
         if len(curved) and np.isin(self.pairs.obstacle, curved).any():
             return False
-        motion = frozen.displacements(interval, dx)
+        motion = frozen.start, dx, frozen.end - frozen.start
         return bool(pair_motion.largest_step(x, *motion, *self.pairs.geometry, KEPT_FRACTION, 1.0) == 1.0)
 
     def distances(self, x: Array, obstacle_x: Array) -> Array:
@@ -322,13 +319,13 @@ class ContactBarrier(LimitsStep):
 
     def gaps(self, x: Array, frozen: ObstaclePositions) -> Array:
         """Distance less thickness [m] between the two simplices of each owned pair, (n_owned,)."""
-        return (self.pairs.scale * self.distances(x, frozen.stage))[: self.n_owned]
+        return (self.pairs.scale * self.distances(x, frozen.end))[: self.n_owned]
 
-    def largest_steps(self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval) -> Array:
-        """Fraction, up to 1, of the displacement dx (n_local, 3) [m] from x on which each pair alone does not
-        collide, (E,), while obstacles move as in an interval of the step.
+    def largest_steps(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Array:
+        """Fraction, up to 1, of the displacement dx (n_local, 3) [m] from x, while obstacles move, on which
+        each pair alone does not collide, (E,).
         """
-        motion, out = frozen.displacements(interval, dx), np.empty(self.n_elements)
+        motion, out = (frozen.start, dx, frozen.end - frozen.start), np.empty(self.n_elements)
         pair_motion.largest_steps(x, *motion, *self.pairs.geometry, KEPT_FRACTION, out)
         return out
 
@@ -336,7 +333,7 @@ class ContactBarrier(LimitsStep):
         """Whether any pair of this rank may come into contact in a step with displacement dx (n_local, 3) [m]
         from x; only pairs that approach by more than ``threshold`` [m] count.
         """
-        motion = frozen.displacements(TO_STAGE, dx)
+        motion = frozen.start, dx, frozen.end - frozen.start
         return bool(pair_motion.may_collide(x, *motion, *self.pairs.geometry, threshold))
 
     def pair(self, element: int) -> Pair:
@@ -347,7 +344,7 @@ class ContactBarrier(LimitsStep):
         )
         parts = (tuple(points[:n_first]), tuple(points[n_first:]))
         number = int(self.pairs.obstacle[element])
-        name = self.obstacles.each[number].name if number >= 0 else ""
+        name = self.obstacles.bodies[number].name if number >= 0 else ""
         return Pair(tuple(part for part in parts if min(part) >= 0), name, self.barrier.thickness)
 
     # -- obstacles that move, and forces on them ---------------------------------------------------
@@ -370,10 +367,10 @@ class ContactBarrier(LimitsStep):
         """Force [N] of this rank's pairs on each obstacle, its torque [N m] about the origin, the sum over
         contacts of the magnitudes of normal forces [N], and 0, (obstacles, 8).
         """
-        out = np.zeros((len(self.obstacles.each), 8))
-        for obstacle, force in self._obstacle_gradients(x, frozen.stage):
+        out = np.zeros((len(self.obstacles.bodies), 8))
+        for obstacle, force in self._obstacle_gradients(x, frozen.end):
             out[obstacle, :6] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
-        contacts = self.find_contacts(x, frozen.stage)
+        contacts = self.find_contacts(x, frozen.end)
         on = contacts.obstacle >= 0
         np.add.at(out[:, 6], contacts.obstacle[on], contacts.force[on])
         return out
@@ -395,9 +392,9 @@ class ContactBarrier(LimitsStep):
         """
         if not self.moving:
             return dx
-        blocked = self.largest_steps(x, dx, frozen, TO_STAGE) < 1.0
+        blocked = self.largest_steps(x, dx, frozen) < 1.0
         moved = dx.copy()
-        for number, (rotation, translation) in enumerate(frozen.stage_motions):
+        for number, (rotation, translation) in enumerate(frozen.motions):
             points = self.pairs.points[blocked & (self.pairs.obstacle == number)]
             points = np.unique(points[points >= 0])
             moved[points] = (x @ rotation.T + translation - x)[points]
@@ -439,12 +436,12 @@ class ContactBarrier(LimitsStep):
 
         Only the owner of a vertex knows all pairs between which its force is divided.
         """
-        contacts = self.find_contacts(x, frozen.stage)
+        contacts = self.find_contacts(x, frozen.end)
         shares = contacts.force[:, None] * np.abs(contacts.sheet_beta)
         return np.bincount(contacts.rows.ravel(), shares.ravel(), len(x)).astype(np.float64)
 
     def history(self, x: Array, frozen: ObstaclePositions) -> Mapping[str, float]:
-        active, n = self.active_pairs(x, frozen.stage), self.n_owned
+        active, n = self.active_pairs(x, frozen.end), self.n_owned
         scale = self.pairs.scale[:n]
         bound = scale * active.lower_bound[:n]
         exact = bound < scale * self.pairs.gap[:n]
@@ -453,7 +450,7 @@ class ContactBarrier(LimitsStep):
         if len(rows):
             distance = np.empty(len(rows))
             near = self.pairs.kind[rows], self.pairs.points[rows]
-            pair_distances.distances(x, frozen.stage, *near, distance)
+            pair_distances.distances(x, frozen.end, *near, distance)
             smallest = min(smallest, (scale[rows] * (distance - self.pairs.offset[rows])).min())
         work = {"friction_work": 0.0}  # replaced by the friction term's if there is one
         return work | {"contacts": float(active.owned_weight.sum()), "smallest_gap": float(smallest)}

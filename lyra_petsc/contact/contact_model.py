@@ -19,9 +19,9 @@ import numpy as np
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array, Mask
+from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.contact.obstacle_points import ObstaclePositions
 from lyra_petsc.contact.one_sided import Springs
-from lyra_petsc.contact.scene_contact import SceneContact
 from lyra_petsc.linear.discretisation import Discretisation
 
 MAX_SOLVES = 20
@@ -54,8 +54,10 @@ class ContactModel:
 
     Parameters
     ----------
-    contact : SceneContact
+    barrier : ContactBarrier
     discretisation : Discretisation
+    known : callable
+        `Collisions._known`.
     x : (n_owned, 3)
         Positions [m] of the iterate.
     c : float
@@ -67,14 +69,15 @@ class ContactModel:
 
     def __init__(
         self,
-        contact: SceneContact,
+        barrier: ContactBarrier,
         discretisation: Discretisation,
+        known: Callable[[Array, Array, float], tuple[Array, Array, float]],
         x: Array,
         c: float,
         free: Mask,
         obstacles: ObstaclePositions,
     ) -> None:
-        self._contact, self._discretisation = contact, discretisation
+        self._barrier, self._discretisation, self._known = barrier, discretisation, known
         self._x, self._c, self._free, self._obstacles = x, c, free, obstacles
 
     def springs_along(self, increment: Array) -> Springs:
@@ -83,18 +86,18 @@ class ContactModel:
         Their blocks are part of the matrix until they are released.
         """
         dx = self._c * increment
-        x, displacement, _ = self._contact.collisions.known_displacement(self._x, dx, 1.0)
+        x, displacement, _ = self._known(self._x, dx, 1.0)
         layout = self._discretisation.layout
         moved = np.linalg.norm(displacement[: layout.n_vertices], axis=1).max(initial=0.0)
         approach = 2.0 * layout.global_max(float(moved))[0]
-        return self._contact.barrier.springs(x, approach, self._obstacles)
+        return self._barrier.springs(x, approach, self._obstacles)
 
     def improve(self, residual: PETSc.Vec, y: PETSc.Vec, solves: LinearSolves, tolerance: float) -> bool:
         """Replace y, the Newton step, by that of the model; returns whether y changed.
 
         ``tolerance`` is that of the linear solves, relative to the residual.
         """
-        release = self._contact.barrier.release_springs
+        release = self._barrier.release_springs
         self._springs = springs = self.springs_along(-y.getArray(readonly=True).reshape(-1, 3))
         first_force, first_stiffness = (springs.acts * part for part in springs.law(springs.length))
         change, size = self._elongations(y), residual.norm()
@@ -156,7 +159,7 @@ class ContactModel:
         """A function that adds springs of a ``stiffness`` (m,) [N/m] to block rows."""
 
         def add(values: Array) -> None:
-            offsets = self._discretisation.rows.pattern.offsets[self._contact.barrier.name]
+            offsets = self._discretisation.rows.pattern.offsets[self._barrier.name]
             self._springs.add_stiffness(self._c * stiffness, offsets, values)
 
         return add

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact.contact_setup import AREA_UNITS, Barrier
-from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles
+from lyra_petsc.contact.obstacle_points import Obstacles
 from lyra_petsc.contact.obstacle_search import ObstacleSearch
 from lyra_petsc.contact.pair_distances import EDGE_EDGE
 from lyra_petsc.contact.pairs import NearPairs, no_near_pairs
 from lyra_petsc.contact.sheet_search import SheetSearch
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.terms.term import UpcomingStep
 
 EDGE_GAP = 0.3
 """Part of the gap below which two edges repel each other, except for sharp edges of obstacles. Sheets that
@@ -82,12 +81,11 @@ class ContactSearch:
         self.distance = barrier.thickness + barrier.gap + self.skin
         self.approach_limit = (EDGE_GAP if self_contact else 1.0) * barrier.gap + self.skin
         self._obstacle_search = ObstacleSearch(self.obstacles, self._sheets, self.distance)
-        start, stage, end = self._next_obstacle_x = self._obstacle_search.x
-        self._at_rest = ObstaclePositions(start, stage, end, self.obstacles.rigid_motions(0.0, 0.0))
+        self._next_obstacle_x = self._obstacle_search.x
 
     @property
     def obstacle_x(self) -> Array:
-        """Points of the obstacles (3, m, 3) [m] of the last search."""
+        """Points of the obstacles (2, m, 3) [m] of the last search."""
         return self._obstacle_search.x
 
     @property
@@ -95,17 +93,15 @@ class ContactSearch:
         """Largest deviation [m] of each obstacle's paths in the step from straight lines."""
         return self._obstacle_search.deviations
 
-    def expect(self, step: UpcomingStep) -> ObstaclePositions:
-        """Take the motion of the obstacles in a step, and return it."""
+    def expect(self, start: float, end: float) -> None:
+        """Take the motion of the obstacles in a step between two times [s]."""
         if not self.obstacles.moving:
-            return self._at_rest
-        times = step.start, step.target_time, step.end
-        start, stage, end = self._next_obstacle_x = np.stack([self.obstacles.positions(t) for t in times])
+            return
+        self._next_obstacle_x = np.stack([self.obstacles.positions(time) for time in (start, end)])
         largest = np.linalg.norm(self._next_obstacle_x - self.obstacle_x, axis=-1).max(initial=0.0)
         planes = (self.obstacles.planes[:, 3] < self.obstacles.first_wall).any()
         self.obstacles_have_moved = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
-        self._obstacle_search.deviations = self.obstacles.path_deviations(step.start, step.end)
-        return ObstaclePositions(start, stage, end, self.obstacles.rigid_motions(*times[:2]))
+        self._obstacle_search.deviations = self.obstacles.path_deviations(start, end)
 
     def near_pairs(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> NearPairs | None:
         """The pairs that may come nearer than `distance` along straight displacements dx (N, 3) [m]
@@ -135,7 +131,7 @@ class ContactSearch:
             limit = max(MAX_PAIRS, MAX_PAIRS_PER_VERTEX * len(x))
         boxes = self._sheets.boxes(x, dx)
         found = [np.empty((0, 7), dtype=np.int64)]
-        if self.obstacles.each:
+        if self.obstacles.bodies:
             found += self._obstacle_search.pairs(x, dx, boxes, self._walled)
         if self._self_contact:
             radius = self.distance

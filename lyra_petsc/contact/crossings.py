@@ -176,8 +176,8 @@ def self_crossings(points: Array, triangles: Ints) -> Ints:
     (n, 2) int64
         Triangles, the lower number first, in lexicographic order; also pairs for which `have_common_vertex`.
     """
-    found = _search(points, triangles, triangles, *_tree(points, triangles), True)
-    return _decide_exactly(points, triangles, triangles, *found)
+    candidates = _search(points, triangles, triangles, *_tree(points, triangles), True)
+    return _decide_exactly(points, triangles, triangles, *candidates)
 
 
 def mutual_crossings(points: Array, triangles: Ints, others: Array, other_triangles: Ints) -> Ints:
@@ -197,8 +197,8 @@ def mutual_crossings(points: Array, triangles: Ints, others: Array, other_triang
     """
     every = np.concatenate([points, others])
     theirs = other_triangles + len(points)
-    found = _search(every, triangles, theirs, *_tree(every, theirs), False)
-    return _decide_exactly(every, triangles, theirs, *found)
+    candidates = _search(every, triangles, theirs, *_tree(every, theirs), False)
+    return _decide_exactly(every, triangles, theirs, *candidates)
 
 
 def have_common_vertex(triangles: Ints, pairs: Ints) -> Mask:
@@ -347,12 +347,12 @@ def _search(
                 if (within and j <= i) or _are_disjoint(lowest, highest, low[k], high[k]):
                     continue
                 d, e, f = triangles[j, 0], triangles[j, 1], triangles[j, 2]
-                found = _crossing(points, a, b, c, d, e, f)
-                if found == 0:
+                crosses = _crossing(points, a, b, c, d, e, f)
+                if crosses == 0:
                     continue
                 if count == len(pairs):
                     pairs, decided = np.concatenate((pairs, pairs)), np.concatenate((decided, decided))
-                pairs[count, 0], pairs[count, 1], decided[count] = i, j, found != UNDECIDED
+                pairs[count, 0], pairs[count, 1], decided[count] = i, j, crosses != UNDECIDED
                 count += 1
     return pairs[:count], decided[:count]
 

@@ -43,6 +43,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms.protocols import Place, Stateful, TermState
 from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.step_end import StepEnd
 from lyra_petsc.terms.term import Assembly, UpcomingStep
 
 STILL = 1e-8
@@ -130,7 +131,7 @@ class CoulombFriction(Stateful):
     def set_up(self, contact: ContactBarrier) -> None:
         """Take the contact term whose pairs have friction."""
         self._contact = contact
-        of_obstacles = [obstacle.friction for obstacle in contact.obstacles.each]
+        of_obstacles = [obstacle.friction for obstacle in contact.obstacles.bodies]
         self._coefficients = np.array([*of_obstacles, self._sheet_friction])
         self.obstacle_loads = np.zeros((len(of_obstacles), 8))
         self.set_pairs(self._pairs, self.stencil, 0)
@@ -149,6 +150,16 @@ class CoulombFriction(Stateful):
         if self._moved[0] != frozen.times:
             self._moved = frozen.times, self._step.moved(frozen.motions)
         return self._moved[1]
+
+    def active_elements(self, x: Array, frozen: ObstacleMotion) -> NDArray[np.bool_]:
+        """Which pairs (E,) have a non-zero Hessian at positions x (n_local, 3): all."""
+        return np.ones(self.n_elements, dtype=np.bool_)
+
+    def hold(self, step: StepEnd, acceleration: Array, frozen: ObstacleMotion) -> Array:
+        """Accelerations (n_owned, 3) [m/s²] at the start of a step with the friction that opposes motion."""
+        from lyra_petsc.contact import impacts  # needed only if something is near
+
+        return impacts.hold_by_friction(step, self, frozen, acceleration)
 
     @property
     def n_friction_pairs(self) -> int:
@@ -378,7 +389,7 @@ class CoulombFriction(Stateful):
         """The rows of `friction_consistency.friction_lag` at positions x (n_local, 3), by the names of
         obstacles; that between sheets is empty.
         """
-        names = [*(obstacle.name for obstacle in self._contact.obstacles.each), ""]
+        names = [*(obstacle.name for obstacle in self._contact.obstacles.bodies), ""]
         contacts = self._contact.find_contacts(x, frozen.end_points)
         step = self._friction(frozen).counted().slid(x)[0]
         return dict(zip(names, friction_lag(step, contacts, len(self._work), len(names)), strict=True))

@@ -20,103 +20,19 @@ Functions with a `StepEnd` are collective.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.contact.friction import CoulombFriction, ObstacleMotion
 from lyra_petsc.contact.friction_step import EndFriction
 from lyra_petsc.contact.obstacle_points import ObstaclePositions, obstacle_loads
 from lyra_petsc.contact.pairs import Contacts, FrictionPairs, Rows
-from lyra_petsc.mesh.points import Layout
-
-END = 1e-3
-"""Last part of a step of second order by whose motion the velocities of obstacles at its end are measured."""
+from lyra_petsc.terms.step_end import ContactImpulses, StepEnd
 
 MAX_SWEEPS, SETTLED = 30, 1e-7
 """Largest number of sweeps over the friction at the start or the end of a step, and change of it in a sweep
 over the largest one below which they end."""
-
-
-class StepEnd(NamedTuple):
-    """The end of a step, or with ``v`` alone its start.
-
-    Attributes
-    ----------
-    layout : Layout
-    mass : (n_owned,)
-        Of each row [kg].
-    free : (n_owned, 3)
-        Unknowns that are not prescribed.
-    held : (m,)
-        Prescribed unknowns, in flattened owned rows.
-    x, v : (n_local, 3)
-        Positions [m] and velocities [m/s], ghosts up to date.
-    start, end : float
-        Times [s].
-    order : int
-        Of the integrator.
-    """
-
-    layout: Layout
-    mass: Array
-    free: Mask
-    held: Ints
-    x: Array
-    v: Array
-    start: float
-    end: float
-    order: int
-
-    @property
-    def dt(self) -> float:
-        """Length of the step [s]."""
-        return self.end - self.start
-
-    @property
-    def last_times(self) -> tuple[float, float]:
-        """Times [s] between which the mean velocity of obstacles is comparable with velocities after the
-        step, which are means of the step under backward Euler.
-        """
-        return self.end - (END if self.order > 1 else 1.0) * self.dt, self.end
-
-    def accelerations(self, force: Array) -> Array:
-        """Forces (n_local, 3) [N], or impulses, over the masses of free unknowns, (n_owned, 3).
-
-        ``force`` gets the sums over ranks in its owned rows.
-        """
-        self.layout.add_to_owners(force)
-        own, mass = force[: self.layout.n_owned], self.mass[:, None]
-        return np.divide(own, mass, out=np.zeros_like(own), where=self.free & (mass > 0.0))
-
-    def handle_force(self, impulse: Array) -> Array:
-        """Mean reaction forces (m,) [N] of handles by impulses [N s], whose owned rows come first."""
-        return -impulse.take(self.held) / self.dt
-
-
-class ContactImpulses(NamedTuple):
-    """Effects of the impulses at the end of a step, on this rank.
-
-    Attributes
-    ----------
-    change : (n_owned, 3)
-        Of the velocities [m/s].
-    handle_force : (m,)
-        Mean reaction forces [N] of handles, at the prescribed unknowns.
-    work, heat : float
-        Work of the obstacles by the impulses, and energy that became heat [J].
-    obstacle, loads : (m,), (m, 8)
-        Numbers of obstacles, and loads on them as from `obstacle_points.obstacle_loads`.
-    """
-
-    change: Array
-    handle_force: Array
-    work: float
-    heat: float
-    obstacle: Ints
-    loads: Array
 
 
 def end_step(

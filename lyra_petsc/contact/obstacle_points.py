@@ -17,42 +17,28 @@ SHARP_ANGLE = 0.5
 """Angle [rad] between two triangles of an obstacle above which their common edge has the full gap."""
 
 
-class StepInterval(NamedTuple):
-    """An interval of a step: 0 is its start, 1 its stage, 2 its end, and time is linear in between.
-
-    With ``begin`` = ``end`` = 1 obstacles stay where they are at the stage.
-    """
-
-    begin: float
-    end: float
-
-
 class ObstaclePositions(NamedTuple):
     """Obstacles in one step.
 
     Attributes
     ----------
-    start, stage, end : (m, 3)
-        Points of all obstacles [m], and normals of planes, at the start, the stage and the end of the step.
-    stage_motions : list of (3, 3) and (3,)
-        Rotation and translation [m] of each obstacle from the start to the stage.
+    start, end : (m, 3)
+        Points of all obstacles [m], and normals of planes, at the start and the end of the step.
+    motions : list of (3, 3) and (3,)
+        Rotation and translation [m] of each obstacle in the step.
+    act : bool
+        Whether contact is part of the equations of the step.
     """
 
     start: Array
-    stage: Array
     end: Array
-    stage_motions: list[tuple[Array, Array]]
+    motions: list[tuple[Array, Array]]
+    act: bool
 
-    def displacements(self, interval: StepInterval, dx: Array) -> tuple[Array, Array, Array]:
-        """Positions of the points at the start of an interval of the step, and the displacements of sheets,
-        dx, and of the points in it.
-        """
-        begin, end = interval
-        if begin >= 1.0:
-            moved = self.end - self.stage
-            return self.stage + (begin - 1.0) * moved, dx, (end - begin) * moved
-        moved = self.stage - self.start
-        return self.start + begin * moved, dx, (end - begin) * moved
+    def part(self, begin: float, end: float) -> ObstaclePositions:
+        """The obstacles between two fractions of the step, on straight lines."""
+        moved = self.end - self.start
+        return self._replace(start=self.start + begin * moved, end=self.start + end * moved)
 
 
 class Obstacles:
@@ -64,7 +50,7 @@ class Obstacles:
         Numbers of three points, number of the obstacle, and for triangles the code of `surface_shares.rings`.
         A plane is a point and a normal. The axis of a nearly flat sphere or rod is also a degenerate
         triangle.
-    each : list of Solid or Container
+    bodies : list of Solid or Container
         First those of the scene, then the symmetry planes.
     first_wall : int
         Number of the first symmetry plane.
@@ -89,7 +75,7 @@ class Obstacles:
         wall_radius: float = 0.0,
     ) -> None:
         self.first_wall = len(obstacles)
-        self.each = obstacles = [*obstacles, *walls]
+        self.bodies = obstacles = [*obstacles, *walls]
         parts: dict[str, list[Ints]] = {
             kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
         }
@@ -141,7 +127,7 @@ class Obstacles:
         self.radius, self.n_points = radius, first
         self.moving = any(obstacle.motion is not None for obstacle in obstacles)
         self._first = np.array(begins, dtype=np.int64)
-        self.places = {each.name: (number, begins[number]) for number, each in enumerate(obstacles)}
+        self.places = {body.name: (number, begins[number]) for number, body in enumerate(obstacles)}
         self._at_rest = [(np.eye(3), np.zeros(3))] * len(obstacles)
         self._fixed_positions: Array | None = None
         if not self.moving:
@@ -152,11 +138,17 @@ class Obstacles:
         if self._fixed_positions is not None:
             return self._fixed_positions
         rows = [np.empty((0, 3))]
-        for obstacle in self.each:
-            rows.append(obstacle.positions(time))
-            if isinstance(obstacle, Container) and obstacle.kind == "planes":
-                rows.append(obstacle.normals_at(time))
+        for body in self.bodies:
+            rows.append(body.positions(time))
+            if isinstance(body, Container) and body.kind == "planes":
+                rows.append(body.normals_at(time))
         return np.concatenate(rows)
+
+    def in_step(self, start: float, end: float, *, act: bool) -> ObstaclePositions:
+        """The obstacles in a step between two times [s]."""
+        return ObstaclePositions(
+            self.positions(start), self.positions(end), self.rigid_motions(start, end), act
+        )
 
     def bounding_boxes(self, x: Array) -> tuple[Array, Array]:
         """Low and high corners (obstacles, 3) [m] of each obstacle over k positions x (k, m, 3) [m]."""
@@ -167,10 +159,10 @@ class Obstacles:
         """Largest deviation [m] of each obstacle's paths from straight lines between two times [s],
         (obstacles,).
         """
-        times, out = np.linspace(start, end, 9), np.zeros(len(self.each))
-        for number, each in enumerate(self.each):
-            if each.motion is not None:
-                first, *between, last = (each.positions(time) for time in times)
+        times, out = np.linspace(start, end, 9), np.zeros(len(self.bodies))
+        for number, body in enumerate(self.bodies):
+            if body.motion is not None:
+                first, *between, last = (body.positions(time) for time in times)
                 chord = last - first
                 square = np.maximum(np.sum(chord * chord, axis=1, keepdims=True), np.finfo(float).tiny)
                 for x in between:
@@ -184,8 +176,8 @@ class Obstacles:
         if not self.moving:
             return self._at_rest
         motions = []
-        for each in self.each:
-            (r0, t0), (r1, t1) = each.rigid_motion(start), each.rigid_motion(end)
+        for body in self.bodies:
+            (r0, t0), (r1, t1) = body.rigid_motion(start), body.rigid_motion(end)
             rotation = r1 @ r0.T
             motions.append((rotation, t1 - rotation @ t0))
         return motions

@@ -25,20 +25,20 @@ class ObstacleSearch:
 
     Attributes
     ----------
-    x : (3, m, 3)
-        Points of the obstacles [m] at the start, the stage and the end of the step.
+    x : (2, m, 3)
+        Points of the obstacles [m] at the start and the end of the step.
     deviations : (obstacles,) or (1,)
         Largest deviation [m] of each obstacle's paths in the step from straight lines.
     """
 
     def __init__(self, obstacles: Obstacles, sheets: SheetSearch, distance: float) -> None:
         self._obstacles, self._sheets, self._distance = obstacles, sheets, distance
-        self.x = np.stack([obstacles.positions(0.0)] * 3)
+        self.x = np.stack([obstacles.positions(0.0)] * 2)
         self.deviations = np.zeros(1)
         self._boxes: tuple[Array, Array] | None = None  # of obstacles at ``x``
 
     def move(self, x: Array) -> None:
-        """Take the points x (3, m, 3) [m] of the present step."""
+        """Take the points x (2, m, 3) [m] of the present step."""
         self.x, self._boxes = x, None
 
     def _within_radius(
@@ -48,11 +48,8 @@ class ObstacleSearch:
         points, bounds = points.astype(np.int64), np.empty(len(points))
         kinds = np.full(len(points), kind)
         radius = self._distance + self._obstacles.radius[obstacle] + self.deviations.max()
-        start = self.x[0]
-        _, to_stage, to_end = self.x - start
-        farther = np.linalg.norm(to_end, axis=1) > np.linalg.norm(to_stage, axis=1)
-        longer = np.where(farther[:, None], to_end, to_stage)
-        pair_distances.swept_distance_bounds(x, start, dx, longer, kinds, points, radius, bounds)
+        start, end = self.x
+        pair_distances.swept_distance_bounds(x, start, dx, end - start, kinds, points, radius, bounds)
         return np.column_stack([kinds, obstacle, points, rings])[bounds < radius]
 
     def pairs(self, x: Array, dx: Array, boxes: Array, walled: NDArray[np.bool_]) -> list[Ints]:

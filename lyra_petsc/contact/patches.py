@@ -53,8 +53,7 @@ def neighbouring_patches(triangles: Ints, uv: Array, patch: Ints) -> Ints:
     one, other = beyond.T
     apart = np.maximum(low[other] + high[one], low[one] + high[other]).max(axis=1)
     pairs = np.concatenate([touching, beyond[apart <= edge]])
-    found: Ints = np.unique(pairs[pairs[:, 0] <= pairs[:, 1]], axis=0)
-    return found
+    return np.asarray(np.unique(pairs[pairs[:, 0] <= pairs[:, 1]], axis=0))
 
 
 def _joined(first: Ints, second: Ints) -> Ints:

@@ -15,7 +15,6 @@ from lyra_petsc.output.tensors import six_components
 from lyra_petsc.stepping.problem import Problem
 
 if TYPE_CHECKING:
-    from lyra_petsc.contact.barrier import ContactBarrier
     from lyra_petsc.terms.bending.hinge import Bending
     from lyra_petsc.terms.bending.midedge import MidEdge
     from lyra_petsc.terms.bending.midedge_shape import Frames
@@ -115,13 +114,10 @@ def _curvature_tensor(problem: Problem) -> Array:
 
 def _contact_pressure(problem: Problem) -> Array:
     """Contact pressure from the sum of the normal forces on both sides; collective."""
-    contact, equations = cast("ContactBarrier", problem.terms["contact"]), problem.equations
-    forces = np.zeros_like(equations.x)
-    forces[:, 0] = contact.normal_forces(equations.x, equations.step.frozen[contact])
-    equations.points.add_to_owners(forces)
-    return _density_on_vertices(
-        problem, np.arange(len(forces), dtype=np.int32), np.ascontiguousarray(forces[:, 0])
-    )
+    equations = problem.equations
+    assert equations.contact is not None
+    forces = equations.contact.report(equations.x, equations.step.frozen).normal_forces()
+    return _density_on_vertices(problem, np.arange(len(forces), dtype=np.int32), forces)
 
 
 def _rank(problem: Problem) -> Array:

@@ -37,8 +37,8 @@ class ActiveTerms:
     Parameters
     ----------
     terms : sequence of Term
-    obstacles : Elastic or None
-        The contact with obstacles that move.
+    obstacles_move : bool
+        Whether the obstacles of contact do.
 
     Attributes
     ----------
@@ -48,21 +48,21 @@ class ActiveTerms:
         Loads that follow the shape of the sheet.
     sheet, external : list of Elastic
         Terms that add to the energy of the sheet, and springs by which handles pull.
-    moving, targets : list of Elastic
-        Terms of ``sheet`` with moving targets or obstacles; of these the ones with targets.
+    moving, targets, obstacles : list of Elastic
+        Terms of ``sheet`` with moving targets or obstacles; those with targets; that with obstacles.
     limiting : list of LimitsStep
         Terms that limit the length of steps, besides contact.
     stateful, dissipating : list of Stateful
         Terms with a state; those of which steps make heat.
-    sliding : list of CoulombFriction
-        Friction of contact, if there is any.
+    of_contact, sliding : list of Elastic
+        The terms of contact, and friction alone, if there are any.
     with_edges : list of HasDirectors
         Terms with directors.
     coarse : dict of Elastic → Elastic
         The terms that replace terms with unknowns of edges on coarse levels of multigrid.
     """
 
-    def __init__(self, terms: Sequence[Term], obstacles: Elastic | None = None) -> None:
+    def __init__(self, terms: Sequence[Term], *, obstacles_move: bool) -> None:
         self.elastic = [term for term in terms if isinstance(term, Elastic)]
         self.viscous = [term for term in terms if isinstance(term, Viscous)]
         self.loads = [term for term in terms if isinstance(term, Load)]
@@ -71,12 +71,14 @@ class ActiveTerms:
         self.external = [term for term in self.elastic if roles[term] is Role.EXTERNAL]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
         self.targets = [term for term in self.sheet if isinstance(term, MovingTargets)]
-        self.moving = [term for term in self.sheet if term in self.targets or term is obstacles]
+        self.obstacles: list[Any] = [t for t in self.sheet if obstacles_move and t.registration.of_contact]
+        self.moving: list[Elastic] = [*self.targets, *self.obstacles]
         self.dissipating = [term for term in self.sheet if isinstance(term, Dissipates)]
         limiting = [term for term in self.elastic if isinstance(term, LimitsStep)]
         self.limiting = [term for term in limiting if not term.registration.of_contact]
         self.stateful = [term for term in self.elastic if isinstance(term, Stateful)]
         self.sliding: list[Any] = [term for term in self.external if term.registration.of_contact]
+        self.of_contact: list[Any] = [term for term in self.elastic if term.registration.of_contact]
         self.with_edges = [term for term in self.elastic if isinstance(term, HasDirectors)]
         self.coarse: dict[Elastic, Elastic] = {}
 

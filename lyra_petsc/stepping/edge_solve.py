@@ -62,11 +62,12 @@ class EdgeSolve:
             stage=Stage(1.0 / dt, dt, dt),
             v_h=np.zeros((n, 3)),
             x_h=equations.points.extended(x_before),
-            frozen=equations.active.with_targets(step.frozen, equations.targets_at(step.end)),
             prescribed=held.reaching(x_before, dt),
             linear=False,
+            in_contact=False,  # vertices do not move
             of_edges=True,
         )
+        equations.change(frozen=equations.active.with_targets(step.frozen, equations.targets_at(step.end)))
         return interrupted
 
     def end(self, equations: StageEquations, solution: Evaluation | None) -> None:

@@ -66,6 +66,8 @@ class StepAccount:
         Energies of the terms with moving targets at both ends.
     external, obstacle_work : float
         Work of handles, springs and loads without a potential; the part of it by moving obstacles.
+    obstacle_work_at_start : float
+        The latter by the forces of contact at the start of the step.
     heat, damping_heat, fabric_heat : float
         Heat of all dampers; of material damping, and of friction within the fabric.
     inertia : float
@@ -78,6 +80,7 @@ class StepAccount:
     moving: float
     external: float
     obstacle_work: float
+    obstacle_work_at_start: float
     heat: float
     damping_heat: float
     fabric_heat: float
@@ -100,18 +103,17 @@ def _work_of(force: Array, x_before: Array, x: Array) -> float:
     return sum(float(np.vdot(force[rows], x[rows] - x_before[rows])) for rows in parts)
 
 
-def _obstacle_work(equations: StageEquations) -> float:
-    """Work [J] of contact from outside on this rank's elements in the step: of moving obstacles by their
-    forces at the stage, and of the impulses at its end.
+def _obstacle_works(equations: StageEquations, x_before: Array) -> tuple[float, float]:
+    """Work [J] of contact from outside on this rank's elements in the step from x_before (n_owned, 3): of the
+    impulses at its end, and of moving obstacles by their forces at its start, or at its end.
     """
-    contact, step = equations.contact, equations.step
-    if contact is None:
-        return 0.0
-    work = contact.impulses.work if contact.impulses else 0.0
-    if contact.obstacles_move:
-        at = step.at_stage if equations.integrator.dynamic else step.end
-        work += contact.barrier.work(equations.evaluated.x, at, step.start, step.end)
-    return work
+    step, impulses = equations.step, equations.contact_end.impulses.work
+    at_start = at_end = impulses
+    for term in equations.active.obstacles if step.in_contact else ():
+        x = equations.points.extended(x_before)
+        at_start += term.work(x, step.start, step.start, step.end)
+        at_end += term.work(equations.evaluated.x, step.end, step.start, step.end)
+    return at_start, at_end
 
 
 def _move_targets_to_end(equations: StageEquations) -> float:
@@ -212,7 +214,7 @@ class EnergyBalance:
         equations = self._equations
         move_frames_to_end(equations)
         external, self.damping, damped = self._external_forces(equations.forces_at_stage())
-        by_obstacles = _obstacle_work(equations)
+        at_start, by_obstacles = _obstacle_works(equations, x_before)
         by_targets = equations.step.moving_energy + by_obstacles
         if self._ends is not None:  # the stage of a load step is at its end: take the mean of both ends
             pull, targets = self._ends
@@ -228,12 +230,12 @@ class EnergyBalance:
         fabric = sum(
             term.heat(equations.x, equations.step.frozen[term]) for term in equations.active.dissipating
         )
-        impacts = equations.contact_impulses.heat if equations.contact_impulses else 0.0
+        impacts = equations.contact_end.impulses.heat
         inertia = kinetic_energy(equations.mass, equations.stage_velocity - equations.step.v_h)
         before, moving_before = self.budget, self._moving_energy
-        local = work, damped, fabric, impacts, by_obstacles, inertia
+        local = work, damped, fabric, impacts, by_obstacles, at_start, inertia
         energies, moving, sums = self._measured(before, *local)
-        work, damped, fabric, impacts, by_obstacles, inertia = sums
+        work, damped, fabric, impacts, by_obstacles, at_start, inertia = sums
         if self._ends is None:  # a handle does work on the sheet through targets that move with it
             work -= moving_before
         heat = damped + fabric + impacts
@@ -242,8 +244,9 @@ class EnergyBalance:
             external_work=before.external_work + work,
             dissipation=before.dissipation + heat,
         )
+        works = work, by_obstacles, at_start
         self.account = StepAccount(
-            before, after, moving_before, moving, work, by_obstacles, heat, damped, fabric, inertia
+            before, after, moving_before, moving, *works, heat, damped, fabric, inertia
         )
         return self.account
 
@@ -259,8 +262,7 @@ class EnergyBalance:
         equations = self._equations
         self._at = at = equations.step.prescribed.indices
         self._reactions, damping, heat = np.zeros(len(at)), np.zeros(len(at)), 0.0
-        if equations.contact_impulses:
-            self._reactions += equations.contact_impulses.handle_force
+        self._reactions += equations.contact_end.impulses.handle_force
         weight = np.zeros((equations.points.n_local, 3))
         for load in equations.active.loads:
             if load.registration.energy:  # loads with a potential do no external work
@@ -330,7 +332,8 @@ class EnergyBalance:
         """
         equations, total = self._equations, np.zeros((count, 8))
         if equations.contact is not None:
-            total += equations.contact.obstacle_loads(equations.x, equations.step.frozen)[:count]
+            report = equations.contact.report(equations.x, equations.step.frozen)
+            total += report.obstacle_loads(equations.contact_end.impulses)[:count]
         equations.points.comm.Allreduce(MPI.IN_PLACE, total)
         return total
 

@@ -158,6 +158,7 @@ class EndForces:
         energies = *self._energies(ends[0]), *self._energies(ends[1])
         sums = layout.global_sum(*energies, work, *of_targets, stiff, uniform_heat).tolist()
         free0, all0, potential0, free1, all1, potential1, work, rise, springs0, springs1, stiff, warm = sums
+        work += 0.5 * (account.obstacle_work_at_start + account.obstacle_work)
         before, after = account.before, account.after
         rise += (after.elastic - account.moving) - (before.elastic - account.moving_before)
         more = warm - account.damping_heat if uniform else 0.0
@@ -203,27 +204,20 @@ class EndForces:
         return self._equations.damping.active and integrator.order > 1 and not integrator.moves_uniformly
 
     def _target_works(self, ends: tuple[StepEndState, StepEndState]) -> tuple[float, float, float, float]:
-        """Work [J] of the motion of targets and obstacles relative to the observer, change of the energies of
-        this rank's terms with targets, and energy of springs at both ends.
+        """Work [J] of the motion of targets relative to the observer, change of the energies of this rank's
+        terms with targets, and energy of springs at both ends.
         """
-        equations, rise, springs = self._equations, 0.0, [0.0, 0.0]
-        contact, impulses = equations.contact, equations.contact_impulses
-        work = impulses.work if impulses else 0.0
-        barrier = friction = None
-        if contact is not None:
-            barrier, friction = contact.barrier, contact.friction
-            if contact.obstacles_move:
-                times = equations.step.start, equations.step.end
-                work += 0.5 * sum(barrier.work(end.x, end.time, *times) for end in ends)
+        equations, rise, work, springs = self._equations, 0.0, 0.0, [0.0, 0.0]
+        sliding, obstacles = equations.active.sliding, equations.active.obstacles
         for term in self._targets:
-            if not term.n_elements or term is barrier:
+            if not term.n_elements or term in obstacles:
                 continue
             # by positions at both ends, and targets at both
             table = [[float(term.energies(end.x, at.frozen[term]).sum()) for at in ends] for end in ends]
             (before, later), (earlier, after) = table
             rise += after - before
-            if term is friction:
-                work += friction.work_of_targets(
+            if term in sliding:
+                work += sliding[0].work_of_targets(
                     (ends[0].x, ends[1].x), (ends[0].frozen[term], ends[1].frozen[term])
                 )
             else:  # the change of energy at fixed positions, averaged over both ends
@@ -236,22 +230,20 @@ class EndForces:
 
     def _force_of_targets(self, ends: tuple[StepEndState, StepEndState]) -> Array:
         """Force (3,) [N] of the sheet on targets and obstacles in the step."""
-        equations, force, contact = self._equations, np.zeros_like(ends[0].x), self._equations.contact
+        equations, force, sliding = self._equations, np.zeros_like(ends[0].x), self._equations.active.sliding
+        barriers = [term for term in equations.active.of_contact if term not in sliding]
         for end in ends:
             for term in self._targets:
                 if not term.registration.of_contact:
                     term.add_gradient(end.x, end.frozen[term], force)
-            if contact is not None:
-                obstacles = contact.barrier.freeze(equations.targets_at(end.time, end.x))
-                contact.barrier.add_gradient(end.x, obstacles, force)
+            for term in barriers:
+                term.add_gradient(end.x, term.freeze(equations.targets_at(end.time, end.x)), force)
         force *= 0.5
-        if contact is not None and contact.friction is not None:
-            # by the force at the stage, which the impulses complete
-            friction = contact.friction
-            friction.add_gradient(equations.evaluated.x, equations.step.frozen[friction], force)
+        for term in sliding:  # by the force at the stage, which the impulses complete
+            term.add_gradient(equations.evaluated.x, equations.step.frozen[term], force)
         total: Array = force[: equations.points.n_vertices].sum(axis=0)
-        impulses = equations.contact_impulses
-        return total + (impulses.loads[:, :3].sum(axis=0) if impulses else 0.0)
+        total += equations.contact_end.impulses.loads[:, :3].sum(axis=0)
+        return total
 
     def _load_work(self, ends: tuple[StepEndState, StepEndState], moved: Array) -> float:
         """Work [J] of wind and of loads without a potential on this rank's free coordinates."""
@@ -298,8 +290,7 @@ class EndForces:
         for load in self._weights:
             load.add_force(ends[1].x, step.start, step.end, weight)
         force = 0.5 * ((start + pull).take(at) + targets.ravel()[at]) - weight.ravel()[at] + damping
-        if equations.contact_impulses:
-            force += equations.contact_impulses.handle_force
+        force += equations.contact_end.impulses.handle_force
         return float(np.vdot(force, displacement))
 
     @cached_property

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lyra_petsc.arrays import Array, Mask
-from lyra_petsc.linear.discretisation import Discretisation
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.time_step import Evaluation
 
 if TYPE_CHECKING:
-    from lyra_petsc.contact.scene_contact import SceneContact
+    from lyra_petsc.contact.collisions import RefusedDisplacement
+    from lyra_petsc.contact.contact_model import ContactModel
 
 MAX_TURN = 0.25
 """Largest angle [rad] by which a Newton iteration of a static analysis may turn a director."""
+
+
+IMPACT_STEP = 0.1
+"""Displacement of a vertex in a step, over the skin of contact, from which on there may be an impact."""
 
 
 def _stage_positions(equations: StageEquations, v: Array) -> Array:
@@ -29,7 +33,7 @@ def limits_steps(equations: StageEquations) -> bool:
     So it is with contact, and in statics with directors, which would else reach a distant equilibrium.
     """
     turns = bool(equations.active.with_edges) and not equations.integrator.dynamic
-    return equations.contact is not None or bool(equations.active.limiting) or turns
+    return equations.acting_contact is not None or bool(equations.active.limiting) or turns
 
 
 def largest_step(equations: StageEquations, v: Array, increment: Array) -> float:
@@ -52,7 +56,7 @@ def moves_freely(equations: StageEquations, v: Array, increment: Array) -> bool:
 
 
 def _largest_step(equations: StageEquations, v: Array, increment: Array, maximum: float) -> float:
-    frozen, contact = equations.step.frozen, equations.contact
+    frozen, contact = equations.step.frozen, equations.acting_contact
     if equations.active.limiting:
         x, displacement = equations.displacement(v, increment)
         allowed = [term.largest_step(x, displacement, frozen[term]) for term in equations.active.limiting]
@@ -60,106 +64,99 @@ def _largest_step(equations: StageEquations, v: Array, increment: Array, maximum
     if contact is None:
         return maximum
     x, dx = _stage_positions(equations, v), equations.step.stage.c * increment
-    return contact.collisions.limit(x, dx, frozen[contact.barrier], maximum)
+    return contact.limit(frozen).largest_step(x, dx, maximum)
 
 
 def separated(equations: StageEquations, v: Array, increment: Array) -> Array | None:
     """The increment (n_owned, 3) [m/s] from v, changed to separate the parts that it brings too near; None if
     there are none.
     """
-    contact, step = equations.contact, equations.step
+    contact, step = equations.acting_contact, equations.step
     if contact is None:
         return None
     x, dx = _stage_positions(equations, v), step.stage.c * increment
-    moved = contact.collisions.separate(x, dx, step.frozen[contact.barrier], step.prescribed.free)
+    moved = contact.limit(step.frozen).separated(x, dx, step.prescribed.free)
     return None if moved is None else moved / step.stage.c
 
 
-def contact_at(
-    equations: StageEquations, v: Array
-) -> tuple[SceneContact, Discretisation, Array, float, Mask, Any]:
-    """What Newton's model of contact takes from the equations at velocities v (n_owned, 3)."""
+def contact_model(equations: StageEquations, v: Array) -> ContactModel:
+    """Newton's model of contact at velocities v (n_owned, 3)."""
     assert equations.contact is not None
     step, x = equations.step, _stage_positions(equations, v)
-    obstacles = step.frozen[equations.contact.barrier]
-    return equations.contact, equations.discretisation, x, step.stage.c, step.prescribed.free, obstacles
+    return equations.contact.limit(step.frozen).model(x, step.stage.c, step.prescribed.free)
 
 
-def find_start(equations: StageEquations) -> Array | None:
-    """Velocities (n_owned, 3) [m/s] from which the step's solve can start without a collision, if any.
+def find_start(equations: StageEquations) -> tuple[Array | None, RefusedDisplacement | None]:
+    """Velocities (n_owned, 3) [m/s] from which the step's solve can start without a collision; or None, and a
+    displacement that collides.
 
     Free vertices stay, or keep their velocities, or obstacles push them; obstacles and prescribed unknowns
     move as they must.
     """
-    still, contact = equations.stationary_velocity(), equations.contact
+    still, contact = equations.stationary_velocity(), equations.acting_contact
     c, n, free = equations.step.stage.c, len(still), equations.step.prescribed.free
     start = still.copy()
     equations.prescribe(start)
     if contact is None:
-        return start
+        return start, None
     driven = np.where(free, 0.0, c * (start - still))
     if not any(equations.points.global_max(contact.obstacles_move or bool(driven.any()))):
-        return start
+        return start, None
     guesses = [np.zeros_like(still)]
     if not equations.integrator.starts_at_rest:
         guesses.append(c * (equations.v[:n] - still))
-    obstacles, pushes = equations.step.frozen[contact.barrier], len(guesses) > 1
-    displacement = contact.collisions.start(equations.x[:n], guesses, driven, free, obstacles, pushes=pushes)
-    if displacement is None:
-        return None
-    start = still + displacement / c
+    collisions = contact.limit(equations.step.frozen)
+    moved, refused = collisions.start(equations.x[:n], guesses, driven, free, pushes=len(guesses) > 1)
+    if moved is None:
+        return None, refused
+    start = still + moved / c
     equations.prescribe(start)
-    return start
+    return start, None
 
 
-def end_is_free(equations: StageEquations, v: Array) -> bool:
-    """Whether the sheet moves from the stage with velocities v (n_owned, 3) to the end of the step without a
-    collision.
+def stays_apart(equations: StageEquations, solution: Evaluation) -> bool:
+    """Whether an integrator for smooth motions may take the step to its end: nothing collides on the way or
+    touches there, and no term that limits steps acts there or at the stage, its ``solution``.
     """
-    iterates, contact, step = equations.integrator.iterates, equations.contact, equations.step
-    if contact is None or (step.ends_at_stage and iterates):
+    step, n, contact = equations.step, len(equations.mass), equations.contact
+    if step.in_contact:
         return True
-    from lyra_petsc.contact.obstacle_points import StepInterval
-
-    x = equations.x[: len(v)]
-    end = equations.integrator.end(x, equations.v[: len(v)], v, step.dt)[0]
-    # Newton's method has checked the displacement to the stage, a single linear solve has not
-    here = _stage_positions(equations, v) if iterates else x
-    return contact.collisions.is_free(here, end - here, step.frozen[contact.barrier], StepInterval(1.0, 2.0))
+    x, active = equations.x[:n], equations.active
+    end = equations.integrator.end(x, equations.v[:n], solution.v[:n], step.dt)[0]
+    step.prescribed.overwrite(end, step.prescribed.goal)
+    ends = (solution.x, equations.points.extended(end)) if active.limiting else ()
+    if any(active.limits_act(at, step.frozen, equations.points) for at in ends):
+        return False
+    if contact is None:
+        return True
+    frozen = equations.active.with_targets(step.frozen, equations.targets_at(step.end))
+    return contact.limit(frozen).stays_apart(x, end - x)
 
 
 def may_collide(equations: StageEquations, approach: float) -> bool:
     """Whether parts may collide in the step, approaching by more than ``approach`` [m]."""
-    if not equations.near or not equations.integrator.dynamic or equations.step.of_edges:
+    contact = equations.acting_contact
+    if contact is None or not equations.integrator.dynamic:
         return False
-    assert equations.contact is not None
-    return equations.contact.may_collide(
-        equations.x, equations.expected_displacement(), equations.step.frozen, approach
-    )
+    collisions, expected = contact.limit(equations.step.frozen), equations.expected_displacement()
+    return collisions.may_collide(equations.x, expected, approach)
 
 
 def may_impact(equations: StageEquations) -> bool:
     """Whether parts that are near move by a notable part of the gap in the step."""
-    if equations.contact is None:
+    contact = equations.acting_contact
+    if contact is None or not contact.near:
         return False
-    return equations.contact.may_impact(
-        equations.step.stage.c * equations.evaluated.v[: equations.points.n_vertices]
-    )
+    moved = equations.step.stage.c * equations.evaluated.v[: equations.points.n_vertices]
+    (largest,) = equations.points.global_max(float(np.abs(moved).max(initial=0.0)))
+    return bool(largest > IMPACT_STEP * contact.skin)
 
 
 def is_resolved(equations: StageEquations) -> bool:
-    """Whether the integrator of the step just accepted can follow the contact in it.
-
-    Those for smooth motions cannot if anything touches, or a term acts that limits steps, at their stage, or
-    their end is beyond such a limit; those of second order for contact if the normal forces have changed too
-    much.
+    """Whether the integrator of the step just taken can follow the contact in it: one of second order only
+    if the normal forces have not changed too much.
     """
-    contact, x, frozen = equations.contact, equations.evaluated.x, equations.step.frozen
-    if equations.integrators.suits_contact:
-        return equations.integrator.order == 1 or contact is None or contact.resolved(equations.step.dt)
-    if equations.active.limits_act(x, frozen, equations.points) or not are_kept(equations, equations.x):
-        return False
-    return contact is None or not contact.is_touching(x, frozen)
+    return equations.integrator.order == 1 or equations.contact_end.resolved
 
 
 def has_friction_pairs(equations: StageEquations) -> bool:
@@ -171,10 +168,10 @@ def follow_contacts(equations: StageEquations, solution: Evaluation) -> bool:
     """Give friction the contacts of the stage that solves the equations, where these differ notably from
     theirs; returns whether they do.
     """
-    if not equations.near or not equations.integrator.dynamic or equations.step.of_edges:
+    contact = equations.acting_contact
+    if contact is None or not equations.integrator.dynamic:
         return False
-    assert equations.contact is not None
-    if not equations.contact.follow(solution.x, equations.x, equations.step.frozen):
+    if not contact.follow(solution.x, equations.x, equations.step.frozen):
         return False
     equations.change()
     return True

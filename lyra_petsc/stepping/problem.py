@@ -51,9 +51,7 @@ from lyra_petsc.terms.term import Elastic, Load, Term
 from lyra_petsc.terms.units_check import unit_notes
 
 if TYPE_CHECKING:
-    from lyra_petsc.contact.barrier import ContactBarrier
     from lyra_petsc.contact.contact_setup import Barrier
-    from lyra_petsc.contact.friction import CoulombFriction
     from lyra_petsc.contact.scene_contact import SceneContact
     from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
 
@@ -385,19 +383,12 @@ def _set_up_contact(
     scene: Scene, whole: WholeProblem, terms: Mapping[str, Term], layout: Layout, mesh: Mesh | None
 ) -> None:
     """Pass the obstacles to the contact and friction terms; collective."""
-    if whole.barrier is None or scene.contact is None:
+    if whole.barrier is None:
         return
-    from lyra_petsc.contact.barrier import ContactBarrier
+    from lyra_petsc.contact.scene_contact import set_up_terms
     from lyra_petsc.mesh.obstacles import build_scene_obstacles
 
-    obstacles = build_scene_obstacles(layout.comm, scene, mesh, Motion)
-    contact = next(term for term in terms.values() if isinstance(term, ContactBarrier))
-    self_contact, static = scene.contact.self, scene.time.static
-    contact.set_up(whole.barrier, obstacles, self_contact=self_contact, static=static)
-    if "friction" in terms:
-        from lyra_petsc.contact.friction import CoulombFriction
-
-        cast(CoulombFriction, terms["friction"]).set_up(contact)
+    set_up_terms(terms, whole.barrier, build_scene_obstacles(layout.comm, scene, mesh, Motion), scene)
 
 
 def _scene_contact(
@@ -408,10 +399,7 @@ def _scene_contact(
         return None
     from lyra_petsc.contact.scene_contact import SceneContact
 
-    barrier, friction = terms["contact"], terms.get("friction")
-    return SceneContact(
-        discretisation, cast("ContactBarrier", barrier), cast("CoulombFriction | None", friction), mass
-    )
+    return SceneContact(discretisation, terms, mass)
 
 
 def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh | None) -> Problem:
@@ -515,9 +503,7 @@ def refuse_contact(equations: StageEquations, scene: Scene, when: str, minimum: 
     """
     if (contact := equations.contact) is None:
         return
-    from lyra_petsc.contact.nearest_pair import nearest_pair
-
-    near = nearest_pair(contact, equations.x, equations.step.frozen[contact.barrier])
+    near = contact.report(equations.x, equations.step.frozen).nearest()
     if near is None or near.gap > minimum:
         return
     distance, remedy = "not apart", "move them apart"

@@ -34,6 +34,7 @@ IMPACT_DT = 0.2
 class Trouble(Enum):
     """Why an attempt at a step is not accepted."""
 
+    TOUCHING = "something touches or nears a limit in a step without contact in its equations"
     UNSOLVED = "no solution is found"
     CROSSING = "parts would cross"
     UNRESOLVED = "contact begins or ends too fast"
@@ -117,6 +118,7 @@ def _give_up(run: SteppedScene, step: RejectedStep) -> NoReturn:
         run.stepper.solver,
         step.attempt.failed_solve,
         step.earlier,
+        refused=step.attempt.refused,
         step=run.step_number + 1,
         time=run.time,
         iterations_key=_iterations_key(),
@@ -136,9 +138,8 @@ def _iterations_key() -> str:
 # -- other integrators ---------------------------------------------------------------------------------
 
 
-def _contact_integrator_waits(run: SteppedScene, step: RejectedStep) -> bool:
-    equations = run.problem.equations
-    return equations.integrator is equations.integrators.usual is not equations.integrators.in_contact
+def _always(run: SteppedScene, step: RejectedStep) -> bool:
+    return True
 
 
 def _take_contact_integrator(run: SteppedScene, step: RejectedStep) -> None:
@@ -160,10 +161,6 @@ def _backward_euler_may_help(run: SteppedScene, step: RejectedStep) -> bool:
         and equations.integrators.usual.name != "beuler"
         and not (kept or _is_substitute(run))
     )
-
-
-def _is_unresolved(run: SteppedScene, step: RejectedStep) -> bool:
-    return True
 
 
 def _follows_impact(run: SteppedScene, step: RejectedStep) -> bool:
@@ -239,10 +236,6 @@ def _halve(run: SteppedScene, step: RejectedStep) -> None:
     run.run_notes.count_repeat(why, run.control.factor * run.control.step)
 
 
-def _is_planned(run: SteppedScene, step: RejectedStep) -> bool:
-    return True
-
-
 def _take_planned(run: SteppedScene, step: RejectedStep) -> None:
     """The step control has planned the step when it judged the error."""
 
@@ -268,17 +261,17 @@ UNSOLVED = (Trouble.UNSOLVED, Trouble.CROSSING)
 
 STRATEGIES = (
     Strategy(
-        "the integrator for contact (`bdf2`, under `semi-implicit` backward Euler)",
-        "the scene's integrator was at work",
-        (Trouble.CROSSING,),
-        _contact_integrator_waits,
+        "the integrator for contact: `bdf2` with its history, under `semi-implicit` backward Euler",
+        "always",
+        (Trouble.TOUCHING,),
+        _always,
         _take_contact_integrator,
     ),
     Strategy(
         "backward Euler: no formula for smooth motions is valid over an impact",
         "always",
         (Trouble.UNRESOLVED,),
-        _is_unresolved,
+        _always,
         _take_backward_euler,
     ),
     Strategy(
@@ -320,7 +313,7 @@ STRATEGIES = (
         "the Δt that the error demands",
         "always",
         (Trouble.INACCURATE,),
-        _is_planned,
+        _always,
         _take_planned,
     ),
     Strategy(

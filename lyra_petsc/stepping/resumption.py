@@ -37,7 +37,7 @@ def saved_state(run: SteppedScene) -> tuple[dict[str, Array], dict[str, Any]]:
         **stepper,
         "energy": None if run.guard is None else run.guard.saved_state(),
         "late_starts": sorted(equations.reference.late),
-        "obstacles": {} if equations.contact is None else equations.contact.barrier.obstacles.places,
+        "obstacles": {} if equations.contact is None else equations.contact.places,
     }
     if run.equilibrium is not None:
         more, scalars["equilibrium"] = run.equilibrium.saved_state(time)
@@ -78,10 +78,10 @@ def resume(
         run.guard.restore(scalars["energy"], same=scalars["scheme"] == run.scene.time.scheme)
     if run.accuracy is not None:
         run.accuracy.restore(arrays, scalars)
-    friction = None if equations.contact is None else equations.contact.friction
-    if friction is not None and friction.name in elements:
-        pairs = elements[friction.name]
-        term_states.restore_changing(friction, equations.points, pairs, scalars["obstacles"])
-        friction.initialise_pairs(equations.x, equations.step.frozen[friction])
+    for friction in equations.active.sliding:
+        if friction.name in elements:
+            pairs = elements[friction.name]
+            term_states.restore_changing(friction, equations.points, pairs, scalars["obstacles"])
+            friction.initialise_pairs(equations.x, equations.step.frozen[friction])
     run.stepper.restore(arrays, scalars, run.time, run.step_number)
     run.run_notes.restore(scalars)

@@ -227,7 +227,7 @@ class SteppedScene:
                 break
             if attempt.converged:
                 self._return_to(x_before, v_before, *histories)
-            else:
+            elif not attempt.touches:
                 failed.append(FailedAttempt.of(attempt, dt, self.stepper.preset))
             recover(self, RejectedStep(trouble, attempt, dt, gains, jumps, failed))
             gains += trouble is Trouble.GAIN
@@ -268,6 +268,8 @@ class SteppedScene:
     def _trouble(self, attempt: Attempt, x_before: Array, v_before: Array, dt: float) -> Trouble | None:
         """Why the attempt at a step of dt [s] from x_before and v_before (n_local, 3) is not accepted."""
         if not attempt.converged:
+            if attempt.touches:
+                return Trouble.TOUCHING
             return Trouble.CROSSING if attempt.message.startswith(WOULD_CROSS) else Trouble.UNSOLVED
         equations, n = self.problem.equations, self.problem.points.n_owned
         if not limits.is_resolved(equations):

@@ -27,10 +27,10 @@ from lyra_petsc.stepping.start_acceleration import StartAcceleration
 from lyra_petsc.stepping.state import State
 from lyra_petsc.stepping.time_step import Evaluation, TimeStep
 from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
+from lyra_petsc.terms.step_end import ContactEnd, StepEnd
 from lyra_petsc.terms.term import Term, UpcomingStep
 
 if TYPE_CHECKING:
-    from lyra_petsc.contact.impacts import ContactImpulses
     from lyra_petsc.contact.scene_contact import SceneContact
 
 
@@ -71,6 +71,8 @@ class StageEquations:
     """
 
     has_active_pairs = nears_limit = False
+    contact_before = contact_end = ContactEnd()
+    """At the start of the step, and at its end once it is taken."""
 
     def __init__(
         self,
@@ -86,7 +88,7 @@ class StageEquations:
     ) -> None:
         self.discretisation, self.mass = discretisation, mass
         moves = contact is not None and contact.obstacles_move
-        self.active = active = ActiveTerms(terms, contact.barrier if contact and moves else None)
+        self.active = active = ActiveTerms(terms, obstacles_move=moves)
         self.contact = contact
         limited = contact is not None or bool(active.limiting)
         self.integrators = IntegratorsInUse(integrator, limited=limited)
@@ -164,8 +166,11 @@ class StageEquations:
         self.change(start=time, end=time)
         self.change(frozen=self.active.freeze(self.targets_at(time)))
         if self.contact is not None:
+            self.contact.begin(time, time)
             self.contact.update(self.x)  # energies at the start of a run need all stencils
-            self.contact.initialise(self.x, self.step.frozen)
+            for term in self.active.sliding:
+                term.initialise_pairs(self.x, self.step.frozen[term])
+            self.contact_before = self.contact.finish(self._finished(), self.step.frozen, None)
         self.nears_limit = self.active.limits_act(self.x, self.step.frozen, self.points)
 
     # -- a step ------------------------------------------------------------------------------------
@@ -174,13 +179,14 @@ class StageEquations:
         """Set up the equations of the step from t0 to t1 [s], and freeze its data; collective."""
         self.predicted_stress.forget()
         at = t0 + self.integrator.stage_offset(t1 - t0)
-        self.change(start=t0, end=t1, prescribed=self.prescriptions.of_step(t0, t1, self.x))
+        in_contact = self.integrators.suits_contact
+        held = self.prescriptions.of_step(t0, t1, self.x)
+        self.contact_end = ContactEnd()
+        self.change(start=t0, end=t1, prescribed=held, in_contact=in_contact)
         if self.contact is not None:
-            self.contact.begin_step()
+            self.contact.begin(t0, t1)
             self.contact.update(self.x, self.expected_displacement(), self.expected_displacement)
         self._freeze(at)
-        if self.contact is not None and self.contact.obstacles_move:  # they may have come near
-            self.contact.update(self.x, self.expected_displacement(), self.expected_displacement)
         self.start_acceleration.begin_step(self.step, self.frozen_positions(at))
         self._set_stage(at)
 
@@ -260,14 +266,14 @@ class StageEquations:
             self.nears_limit = self.active.limits_act(self.x, step.frozen, self.points)
         if not self.integrator.dynamic or self.contact is None:
             return
-        if not step.ends_at_stage:  # pairs that come near between the stage and the end
-            self.contact.update(self.evaluated.x, self.x - self.evaluated.x)
         self.state.keep_past(rate_before)
-        end = step.contact_end(self.points, self.mass, self.x, self.v, self.integrator.order)
-        impulses = self.contact.finish(end, step.frozen, damps=self.integrators.suits_contact)
-        if impulses is not None:
-            self.state.set(self.x[:n], self.v[:n] + impulses.change)
-            self.integrators.in_contact.shift_past_velocities(impulses.change)
+        if not step.in_contact:
+            return
+        self.contact_end = self.contact.finish(self._finished(), step.frozen, self.contact_before)
+        if self.near:
+            change = self.contact_end.impulses.change
+            self.state.set(self.x[:n], self.v[:n] + change)
+            self.integrators.in_contact.shift_past_velocities(change)
 
     def output_velocity(self) -> Array:
         """Velocities (n_owned, 3) [m/s] for output: those of prescribed unknowns are ẋ*(t)."""
@@ -302,8 +308,8 @@ class StageEquations:
     def revisit(self, evaluation: Evaluation) -> Evaluation:
         """An evaluation of the present step again, with the pairs that are near there; collective."""
         self.evaluated = evaluation
-        if self.contact is not None:
-            self.contact.update(evaluation.x)
+        if self.acting_contact is not None:
+            self.acting_contact.update(evaluation.x)
         return self.evaluated
 
     def residual_at(self, v: Array) -> Array:
@@ -337,10 +343,14 @@ class StageEquations:
 
     # -- contact -------------------------------------------------------------------------------------
 
+    def _finished(self) -> StepEnd:
+        """The end of the step, at the state."""
+        return self.step.finished(self.points, self.mass, self.x, self.v, self.integrator.order)
+
     @property
-    def contact_impulses(self) -> ContactImpulses | None:
-        """The impulses of contact at the end of the step just accepted."""
-        return None if self.contact is None else self.contact.impulses
+    def acting_contact(self) -> SceneContact | None:
+        """The contact that is part of the equations of the step."""
+        return self.contact if self.step.in_contact else None
 
     @property
     def near(self) -> bool:
@@ -350,7 +360,7 @@ class StageEquations:
     @property
     def touches(self) -> bool:
         """Whether anything touches, or a term acts that limits steps, at the positions of the state."""
-        return self.nears_limit or (self.contact is not None and self.contact.touches)
+        return self.nears_limit or self.contact_before.touches
 
     def _follow_ghosts(self) -> None:
         """Resize all arrays to the layout's present ghosts; collective."""
@@ -367,7 +377,8 @@ class StageEquations:
         Returns whether the pattern changed; collective.
         """
         frozen = self.step.frozen
-        acting = self.contact.acting(self.evaluated.x, frozen) if self.contact and self.near else {}
+        terms = self.active.of_contact if self.near else []
+        acting = {term.name: term.active_elements(self.evaluated.x, frozen[term]) for term in terms}
         number = sum(int(np.count_nonzero(mask)) for mask in acting.values())
         self.has_active_pairs = bool(acting) and any(self.points.global_max(number))
         changed = self.discretisation.update_pattern(acting)
@@ -376,11 +387,10 @@ class StageEquations:
         return changed
 
     def follow_step(self, v_before: Array) -> None:
-        """Let contact, and the integrators that did not take the step just accepted, from velocities v_before
-        (n_owned, 3), go on from its end.
+        """Go on from the end of the step just accepted, from velocities v_before (n_owned, 3), also with the
+        integrators that did not take it.
         """
-        if self.contact is not None:
-            self.contact.accept()
+        self.contact_before = self.contact_end
         if self.integrator is not self.integrators.usual:
             rate = (self.stage_velocity - v_before) / self.step.dt
             moves = self.step.prescribed.free & (self.mass[:, None] > 0.0)

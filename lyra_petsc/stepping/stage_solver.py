@@ -163,20 +163,20 @@ class StageSolver:
         ts.setErrorIfStepFails(False)
         ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
 
+    def _print_contact(self, snes: PETSc.SNES, number: int, norm: float) -> None:
+        """The monitor ``-contact_monitor``: contact at each iterate, below the line of ``-snes_monitor``."""
+        equations, contact = self._equations, self._equations.contact
+        assert contact is not None
+        x = equations.evaluate(snes.getSolution().getArray(readonly=True).reshape(-1, 3)).x
+        line = contact.report(x, equations.step.frozen).iterate(self.newton.step_fraction)
+        PETSc.Sys.Print(f"{' ' * snes.getTabLevel()}{number:3d} {line}", comm=equations.points.comm)
+
     def _set_monitors_and_tolerances(self, scene: Scene, floor: float) -> None:
         equations, newton, snes, ksp = self._equations, self.newton, self.snes, self.ksp
         if equations.discretisation.stencils_change or (equations.active.with_edges and self._iterates):
             snes.setUpdate(self._update)
         if PETSc.Options().getBool("contact_monitor", False) and equations.contact is not None:
-            from lyra_petsc.contact.contact_monitor import ContactMonitor  # needed with the option only
-
-            snes.setMonitor(
-                ContactMonitor(
-                    equations.contact,
-                    lambda v: (equations.evaluate(v).x, equations.step.frozen),
-                    lambda: newton.step_fraction,
-                )
-            )
+            snes.setMonitor(self._print_contact)
         if not self._iterates:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=TIGHTEST)

@@ -14,12 +14,10 @@ from lyra_petsc.stepping.integrators.integrator import NeedsAcceleration
 from lyra_petsc.stepping.prescribed import Prescriptions
 from lyra_petsc.stepping.state import State
 from lyra_petsc.stepping.time_step import Evaluation, TimeStep
+from lyra_petsc.terms.step_end import INSTANT
 
 if TYPE_CHECKING:
     from lyra_petsc.contact.scene_contact import SceneContact
-
-JUST_AFTER = 1e-3
-"""Part of a step after which handles have the velocities with which it starts."""
 
 MAX_ITERATIONS = 100
 """Largest number of iterations for the rates of directors, whose equations are well-conditioned."""
@@ -91,7 +89,7 @@ class StartAcceleration:
         active, mass, v = forces.active, forces.mass[:, None], state.v.copy()
         if step.dt > 0.0:
             # of handles just after the start, where they may jump
-            soon = step.start + JUST_AFTER * step.dt
+            soon = step.start + INSTANT * step.dt
             rates = self._prescriptions.rates(step.prescribed, step.start, step.end, soon)
             step.prescribed.overwrite(v[: len(mass)], rates)
         layout.update_ghosts(v)
@@ -103,11 +101,10 @@ class StartAcceleration:
             self._balance_moments(step, v)
         force = self._out_of_balance(step, v)
         acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
-        if self._contact is None:
-            return acceleration
-        order = self._integrators.present.order
-        start = step.contact_end(layout, forces.mass, state.x, v, order)
-        return self._contact.hold(start, acceleration, step.frozen)
+        start = step.finished(layout, forces.mass, state.x, v, self._integrators.present.order)
+        for term in active.sliding if self._contact is not None and self._contact.near else ():
+            acceleration = term.hold(start, acceleration, step.frozen[term])
+        return acceleration
 
     def _out_of_balance(self, step: TimeStep, v: Array) -> Array:
         """Force (n_owned, 3) [N] on the free unknowns at the state's positions with velocities v."""

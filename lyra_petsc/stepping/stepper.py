@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -29,6 +29,9 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.stage_solver import StageSolver
 from lyra_petsc.stepping.time_step import Evaluation
 
+if TYPE_CHECKING:
+    from lyra_petsc.contact.collisions import RefusedDisplacement
+
 
 @dataclass(frozen=True)
 class Attempt:
@@ -44,6 +47,10 @@ class Attempt:
         Why the attempt failed; else empty.
     at_roundoff : bool
         Whether the solve ended because the residual was round-off.
+    refused : RefusedDisplacement or None
+        A displacement that collides, where the step has no start without a collision.
+    touches : bool
+        Whether it failed because something touches in a step without contact in its equations.
     failed_solve : FailedSolve or None
         The last iterate and residual of a failed attempt.
     """
@@ -55,6 +62,8 @@ class Attempt:
     remaining: float = math.inf
     message: str = ""
     at_roundoff: bool = False
+    refused: RefusedDisplacement | None = None
+    touches: bool = False
     failed_solve: FailedSolve | None = None
 
 
@@ -193,25 +202,27 @@ class Stepper:
         with PETSc.Log.Event(FROZEN):
             equations.begin_step(t0, t1)
         number = solver.ts.getStepNumber()
-        start = limits.find_start(equations)
+        start, refused = limits.find_start(equations)
         if start is None or not has_start(equations, start):
             message = WOULD_CROSS if start is None else BEYOND_LIMIT
             failed = solver.solve_without_start()
-            return Attempt(False, 0, 0, math.inf, message=message, failed_solve=failed)
+            return Attempt(False, 0, 0, math.inf, message=message, refused=refused, failed_solve=failed)
         solves = [solver.solve(start)]
         while self._iterates and len(solves) < MAX_SOLVES and (reached := solves[-1].evaluation) is not None:
             if not limits.follow_contacts(equations, reached):
                 break
             solves.append(solver.solve(start, reached.v[:n]))
         solution, message = solves[-1].evaluation, solves[-1].message
-        if solution is not None and not limits.end_is_free(equations, solution.v[:n]):
-            solution, message = None, WOULD_CROSS
+        touches = False
+        if solution is not None and not equations.step.in_contact:
+            touches = not limits.stays_apart(equations, equations.revisit(solution))
+            solution = equations.evaluated  # with the ghosts of pairs on the way
         outcome = solver.convergence
         norm, remaining, at_roundoff = outcome.norm, outcome.remaining, outcome.at_roundoff
         failure: FailedSolve | None = None
         if solution is None:
             failure = solver.failed_solve()
-        else:
+        elif not touches:
             before = equations.x[:n], equations.v[:n]
             equations.accept(self._turn_directors(solution))
             if edge_solve.is_needed(equations):
@@ -225,15 +236,17 @@ class Stepper:
         newton = sum(solve.newton_iterations for solve in solves)
         linear = sum(solve.linear_iterations for solve in solves)
         solver.ts.setTimeStep(t1 - t0)
-        if failure is None:
+        if failure is None and not touches:
             self.start(t1, number + 1)
             return Attempt(True, newton, linear, norm, remaining, at_roundoff=at_roundoff)
         solver.ts.setTime(t0)
         solver.ts.setStepNumber(number)
         solver.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        if solver.improve_factors():
+        if not touches and solver.improve_factors():
             return self.attempt(t0, t1)
-        return Attempt(False, newton, linear, outcome.norm, message=message, failed_solve=failure)
+        return Attempt(
+            False, newton, linear, outcome.norm, message=message, touches=touches, failed_solve=failure
+        )
 
     def _turn_directors(self, solution: Evaluation) -> Evaluation:
         """The solution of one linear solve, whose directors turn with their triangles if they turn far."""

@@ -7,7 +7,7 @@ further entry, `VERTICES`, of the term.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,10 +15,6 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.protocols import Place, Stateful, TermState
 from lyra_petsc.terms.term import Elastic
-
-if TYPE_CHECKING:
-    from lyra_petsc.contact.friction import CoulombFriction
-
 
 VERTICES = "vertices"
 """Name of the entry with the numbers of the vertices of a term's elements."""
@@ -103,7 +99,7 @@ def restore_fixed(
 
 
 def restore_changing(
-    friction: CoulombFriction,
+    friction: Any,
     layout: Layout,
     elements: ElementState,
     places: Mapping[str, tuple[int, int]],

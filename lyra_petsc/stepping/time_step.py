@@ -14,10 +14,10 @@ from lyra_petsc.stepping.applied_loads import StepLoads
 from lyra_petsc.stepping.integrators.integrator import Stage
 from lyra_petsc.stepping.prescribed import PrescribedUnknowns
 from lyra_petsc.stepping.reference_positions import ReferencePositions
+from lyra_petsc.terms.step_end import StepEnd
 from lyra_petsc.terms.term import Term, UpcomingStep
 
 if TYPE_CHECKING:
-    from lyra_petsc.contact.impacts import StepEnd
     from lyra_petsc.stepping.forces import StageForces
 
 _numbers = itertools.count()
@@ -49,6 +49,9 @@ class TimeStep:
         Whether F is linear in the velocities, from the positions where the step starts (``semi-implicit``).
     lagged : bool
         Whether loads that depend on velocities are those at the start.
+    in_contact : bool
+        Whether contact is part of the equations: not where the stage is before the end or one linear solve
+        finds it. Nothing may then touch at either end.
     of_edges : bool
         Whether only the edges' unknowns are solved for, at the end of the step.
     number : int
@@ -68,6 +71,7 @@ class TimeStep:
     moving_energy: float = 0.0
     linear: bool = False
     lagged: bool = False
+    in_contact: bool = True
     of_edges: bool = False
     number: int = field(default_factory=lambda: next(_numbers), init=False)
 
@@ -83,12 +87,10 @@ class TimeStep:
 
     def upcoming(self, time: float, x: Array, reference: ReferencePositions) -> UpcomingStep:
         """The step as terms receive it to freeze their data at positions x (n_local, 3) and a time [s]."""
-        return UpcomingStep(self.start, self.end, time, x, reference.at)
+        return UpcomingStep(self.start, self.end, time, x, reference.at, self.in_contact)
 
-    def contact_end(self, layout: Layout, mass: Array, x: Array, v: Array, order: int) -> StepEnd:
+    def finished(self, layout: Layout, mass: Array, x: Array, v: Array, order: int) -> StepEnd:
         """The end of the step with positions and velocities x, v (n_local, 3), for contact."""
-        from lyra_petsc.contact.impacts import StepEnd
-
         held = self.prescribed
         return StepEnd(layout, mass, held.free, held.indices, x, v, self.start, self.end, order)
 

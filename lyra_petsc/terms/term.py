@@ -76,6 +76,8 @@ class UpcomingStep:
     reference : callable
         Takes a start time [s] and local rows (n,); returns their positions (n, 3) [m] at that time, from
         which the motion of handles that start then is applied.
+    in_contact : bool
+        Whether contact is part of the equations of the step.
     """
 
     start: float
@@ -83,6 +85,7 @@ class UpcomingStep:
     target_time: float
     x: Array
     reference: Callable[[float, Ints], Array]
+    in_contact: bool = True
 
 
 class Assembly(NamedTuple):

@@ -89,7 +89,7 @@ class Watched:
         """Check that nothing crosses; collective."""
         x = self.x
         found = [len(self_crossings(x, self.triangles))]
-        for obstacle in self.term.obstacles.each:
+        for obstacle in self.term.obstacles.bodies:
             found.append(self._in(x, obstacle))
         assert not any(found), f"t = {self.simulation.time}: {found} cross"
 

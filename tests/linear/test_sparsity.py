@@ -127,6 +127,7 @@ MEMBRANE_SCENE = {
     "protocols",
     "registry",
     "rest",
+    "step_end",
     "term",
     "units_check",
 }

@@ -8,7 +8,6 @@ import pytest
 from mpi4py import MPI
 from physics import grid, scene_of
 
-from lyra_petsc.contact.nearest_pair import blocking_pair, nearest_obstacle
 from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -203,8 +202,8 @@ def test_the_nearest_obstacle_is_named_even_if_sheets_are_nearer(comm: MPI.Comm)
         simulation = SteppedScene(comm, scene_of(scene | {"obstacles": obstacles}))
         simulation.step()
         equations = simulation.problem.equations
-        x, frozen = equations.evaluated.x, equations.step.frozen[equations.contact.barrier]
-        nearest, obstacle = (find(equations.contact, x, frozen) for find in (blocking_pair, nearest_obstacle))
+        report = equations.contact.report(equations.evaluated.x, equations.step.frozen)
+        nearest, obstacle = report.nearest(), report.nearest_obstacle()
         assert nearest is not None
         assert not nearest.obstacle
         assert (None if obstacle is None else obstacle.obstacle) == name

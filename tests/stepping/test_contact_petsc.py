@@ -88,7 +88,7 @@ def test_the_monitor_shows_contact_and_friction(comm: MPI.Comm, capfd: pytest.Ca
         columns = simulation.energy_balance.columns()
         touching.append((columns["contacts"], columns["smallest_gap"]))
         # the monitor shows forces of the barrier only
-        damped = comm.allreduce(float(simulation.problem.equations.contact_impulses.loads[:, 2].sum()))
+        damped = comm.allreduce(float(simulation.problem.equations.contact_end.impulses.loads[:, 2].sum()))
         weights.append(simulation.energy_balance.obstacle_forces(1)[0, 2] - damped)
     PETSc.Sys.syncFlush(comm)
     out = capfd.readouterr().out

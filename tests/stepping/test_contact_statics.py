@@ -60,7 +60,7 @@ def at_rest(comm: MPI.Comm, scene: dict[str, Any]) -> tuple[SteppedScene, Array,
         assert mesh is not None
         triangles = mesh.triangles.astype(np.int64)
         found = len(self_crossings(x, triangles))
-        for one in term.obstacles.each:  # type: ignore[attr-defined]
+        for one in term.obstacles.bodies:  # type: ignore[attr-defined]
             is_box = "box" in scene["obstacles"][one.name]
             found += sum(map(len, find_overlaps(one, x, triangles, 1.0, is_box=is_box)))
         return found
@@ -154,7 +154,7 @@ def test_friction_holds_a_strip_over_a_rod_within_mu_times_the_normal_force(
     assert isinstance(term, ContactBarrier)
     torque = abs(simulation.energy_balance.obstacle_forces(1)[0, 4])
     allowed = (
-        MU * RADIUS * float(term.find_contacts(equations.x, equations.step.frozen[term].stage).force.sum())
+        MU * RADIUS * float(term.find_contacts(equations.x, equations.step.frozen[term].end).force.sum())
     )
     simulation.destroy()
     assert newton < 250

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.parallel(3)
 SPEED, END = 0.5, 0.12
 FLOOR: dict[str, Any] = {"plane": {"point": [0.0, 0.0, -0.021], "normal": [0.0, 0.0, 1.0]}}
 UP = [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, SPEED]}]
+SLOWLY = [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, 0.02]}]
 
 
 def impact(integrator: str, step: float, *, floor_moves: bool) -> dict[str, Any]:
@@ -128,6 +129,24 @@ def test_contacts_reached_after_the_stage_are_noticed_in_the_same_step(integrato
     assert steps < 300
     assert (x[:, 2] > 0.0).all()
     assert (x[:, 2] < 0.003).all()
+
+
+@pytest.mark.parallel(1)
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2"])
+@pytest.mark.parametrize("floor_moves", [False, True])
+def test_bdf2_takes_the_first_step_in_contact_with_its_history(integrator: str, floor_moves: bool) -> None:
+    scene = impact(integrator, 1e-3, floor_moves=floor_moves)
+    slow: dict[str, Any] = {"initial": {"velocity": [0.0, 0.0, -0.02]}}
+    if floor_moves:
+        slow = {"obstacles": {"floor": scene["obstacles"]["floor"] | {"motion": SLOWLY}}}
+    simulation = SteppedScene(MPI.COMM_SELF, scene_of(scene | slow))
+    integrators, rejected = simulation.problem.equations.integrators, 0
+    while simulation.energy_balance.columns()["contacts"] == 0.0:
+        past = len(integrators.in_contact.saved_state()[0])
+        rejected = simulation.step().rejected
+    taken, number = simulation.last_integrator.name, simulation.step_number
+    simulation.destroy()
+    assert (taken, rejected, past, number > 10) == ("bdf2", 1, 4, True)
 
 
 @pytest.mark.parametrize(

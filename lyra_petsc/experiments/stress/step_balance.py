@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -39,9 +39,6 @@ from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.protocols import MovingTargets
 from lyra_petsc.terms.term import Elastic
-
-if TYPE_CHECKING:
-    from lyra_petsc.contact.barrier import ContactBarrier
 
 CONTACT_PANELS, HALVED_PANELS, MAX_PANELS = 16, 128, 1024
 """Fewest panels of the integral for contact, which has at least one for each half gap, as a barrier is as
@@ -71,7 +68,14 @@ def energy(terms: Terms, x: Array) -> float:
 
 
 def force_work(
-    comm: MPI.Comm, n: int, terms: Terms, start_frames: Terms, x0: Array, dx: Array, tolerance: float
+    comm: MPI.Comm,
+    n: int,
+    terms: Terms,
+    start_frames: Terms,
+    x0: Array,
+    dx: Array,
+    tolerance: float,
+    skin: float = math.inf,
 ) -> tuple[float, bool]:
     """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J], and whether energy differences replace a part of it; collective.
 
@@ -88,6 +92,8 @@ def force_work(
         Positions at the start of the step and displacements [m].
     tolerance : float
         Error of the integral [J] that is accepted.
+    skin : float
+        That of contact [m].
     """
     from scipy.integrate import fixed_quad, quad_vec
 
@@ -119,11 +125,7 @@ def force_work(
     value, by_energies = float(along_membrane), False
     turn = math.inf if start_frames else _largest_turn(hinges, x0, dx)
     smooth = comm.allreduce(turn, op=MPI.MAX) < LARGEST_TURN
-    largest_dx, skin = (
-        largest(comm, dx[:n]),
-        min((cast("ContactBarrier", term).search.skin for term in contact), default=0.0),
-    )
-    panels = max(CONTACT_PANELS, math.ceil(largest_dx / skin) if skin > 0.0 else 0)
+    panels = max(CONTACT_PANELS, math.ceil(largest(comm, dx[:n]) / skin))
     for part, refine, first in ((hinges, smooth, 1), (contact, True, panels)):
         if part:
             integral = refined(part, first) if refine else None
@@ -255,7 +257,8 @@ class BalanceRecorder:
             noise += powers + account.before.kinetic + account.after.kinetic + heights
             floor += left["residual"] * math.sqrt(free_dx)
         tolerance = floor + ROUNDOFF * noise
-        work, jumped = force_work(comm, n, sheet, frames, x0, dx, 0.1 * tolerance)
+        skin = math.inf if equations.contact is None else equations.contact.skin
+        work, jumped = force_work(comm, n, sheet, frames, x0, dx, 0.1 * tolerance, skin)
         change = account.after.elastic - account.before.elastic + account.fabric_heat
         sizes = [change, work]
         if self._identity:
@@ -378,9 +381,8 @@ class BalanceRecorder:
         equations, comm = self._equations, self._equations.points.comm
         n, rows = equations.points.n_owned, slice(0, equations.points.n_vertices)
         reaction = self._simulation.energy_balance.reaction
-        if equations.contact_impulses is not None:
-            at = equations.step.prescribed.indices
-            reaction.put(at, reaction.take(at) - equations.contact_impulses.handle_force)
+        at = equations.step.prescribed.indices
+        reaction.put(at, reaction.take(at) - equations.contact_end.impulses.handle_force)
         internal, damping = within
         damped = dt * (sum(parts.values()) - internal - reaction)
         linear = (damped - dt * damping)[rows].sum(axis=0)

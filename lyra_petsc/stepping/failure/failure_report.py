@@ -18,7 +18,8 @@ from lyra_petsc.stepping.stage_solver import StageSolver
 from lyra_petsc.stepping.stepper import BEYOND_LIMIT, Attempt
 
 if TYPE_CHECKING:
-    from lyra_petsc.contact.nearest_pair import NearPair
+    from lyra_petsc.contact.collisions import RefusedDisplacement
+    from lyra_petsc.contact.contact_report import NearPair
 
 MAX_SHOWN = 8
 """Largest number of iterations, or of attempts, that the few lines show without abridging them."""
@@ -208,6 +209,7 @@ def explain_failure(
     solve: FailedSolve,
     attempts: list[FailedAttempt],
     *,
+    refused: RefusedDisplacement | None,
     step: int,
     time: float,
     iterations_key: str,
@@ -224,6 +226,8 @@ def explain_failure(
         Of the last attempt.
     attempts : list of FailedAttempt
         All attempts at this step.
+    refused : RefusedDisplacement or None
+        A displacement of the last one that collides.
     step : int
         Number of the step, from 1.
     time : float
@@ -235,11 +239,9 @@ def explain_failure(
     diagnosis = diagnose(problem.points, solve, equations.x, problem.tags)
     near = obstacle = None
     if (contact := equations.contact) is not None:
-        from lyra_petsc.contact.nearest_pair import blocking_pair, nearest_obstacle
-
-        x, frozen = equations.evaluated.x, equations.step.frozen[contact.barrier]
-        near = blocking_pair(contact, x, frozen)
-        obstacle = nearest_obstacle(contact, x, frozen) if near is not None and not near.obstacle else None
+        report = contact.report(equations.evaluated.x, equations.step.frozen)
+        near = report.nearest(refused)
+        obstacle = report.nearest_obstacle() if near is not None and not near.obstacle else None
     static, kind = not equations.integrator.dynamic, diagnosis.kind
     shorter = (
         "a smaller time.step (first increment of the load), or a damped motion instead"

@@ -187,7 +187,7 @@ class Convergence:
         """
         equations, was_good = self._equations, self._met_tolerances
         self._met_tolerances = True
-        if was_good or not (equations.contact is not None and equations.integrator.dynamic):
+        if was_good or not equations.integrator.dynamic:
             return False
         enough, part = self.force_tolerance(), FINER_IN_CONTACT
         coarse = self.norm > part * enough or self.remaining > part * tolerance

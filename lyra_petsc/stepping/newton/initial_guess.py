@@ -41,7 +41,7 @@ def first_guess(equations: StageEquations, start: Array, out: Array) -> bool:
     if limits.limits_steps(equations):
         fraction = limits.largest_step(equations, still, moving - still)
         moving = moving if fraction == 1.0 else still + fraction * (moving - still)
-    if integrator.order > 1 and equations.contact is None and not equations.active.limiting:
+    if integrator.order > 1 and equations.acting_contact is None and not equations.active.limiting:
         out[:] = moving
         return False
     energies = [equations.evaluate(v).objective[0] for v in (still, moving)]

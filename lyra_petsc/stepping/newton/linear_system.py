@@ -228,7 +228,7 @@ class LinearSystem:
             return []
         numbers = [rows.pattern.n_couplings for rows in (discretisation.fixed, discretisation.rows)]
         fixed, every = equations.points.global_sum(*numbers).astype(np.int64)
-        pairs = equations.contact.summary(equations.evaluated.x, equations.step.frozen)
+        pairs = equations.contact.report(equations.evaluated.x, equations.step.frozen).pairs()
         return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({pairs})"]
 
     def _hierarchy(self, *, spare: bool) -> Hierarchy:

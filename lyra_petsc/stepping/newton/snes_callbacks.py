@@ -213,7 +213,6 @@ class NewtonCallbacks:
 
     def _apply_contact_model(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Replace a step y by that of `ContactModel`, which sees contacts along it; whether it changed."""
-        from lyra_petsc.contact.contact_model import ContactModel  # needed with small gaps only
         from lyra_petsc.stepping.newton.repeated_solves import RepeatedSolves
 
         def at() -> Evaluation:
@@ -228,7 +227,7 @@ class NewtonCallbacks:
             return self._ease_linear_solve(x)
 
         solves = RepeatedSolves(self._ksp, self._linear, at, renew, ease)
-        model = ContactModel(*limits.contact_at(self._equations, self._array(x)))
+        model = limits.contact_model(self._equations, self._array(x))
         changed = model.improve(residual, y, solves, self.forcing.effective_tolerance)
         self.contact_iterations += solves.iterations
         return changed

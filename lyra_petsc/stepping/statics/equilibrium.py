@@ -264,8 +264,7 @@ class Equilibrium:
     def _potential_energy(self, start: Array) -> float:
         """Energy [J] without friction, less the work of loads from ``start`` (n_owned, 3); collective."""
         equations, frozen = self._equations, self._equations.step.frozen
-        friction = None if equations.contact is None else equations.contact.friction
-        terms = [term for term in equations.active.elastic if term is not friction]
+        terms = [term for term in equations.active.elastic if term not in equations.active.sliding]
         energy = sum(float(term.energies(equations.x, frozen[term]).sum()) for term in terms)
         energy -= float(np.vdot(equations.step.loads.force, equations.x[: len(start)] - start))
         return float(equations.points.global_sum(energy)[0])

@@ -61,7 +61,7 @@ class FrictionBalance:
     def __init__(self, equations: StageEquations, spacing: float, end: float) -> None:
         self._equations, self._spacing = equations, spacing
         self._longest = end / LANDING_PARTS
-        self._acts = equations.contact is not None and equations.contact.friction is not None
+        self._acts = bool(equations.active.sliding)
         self.lag, self.is_rough, self.lands = 0.0, False, False
         self._rounds = self._sliding_steps = 0
         self._sliding_increment = 0.0  # the last increment of the load factor in which all slid

@@ -96,7 +96,7 @@ class Stops:
     """Springs that act beyond points (m,) on the x axis: their second derivatives jump, as where the nearest
     feature of a pair in contact changes."""
 
-    registration, search = SimpleNamespace(of_contact=True), SimpleNamespace(skin=0.01)
+    registration = SimpleNamespace(of_contact=True)
 
     def __init__(self, at: Array) -> None:
         self.at = at
@@ -114,7 +114,7 @@ def test_the_work_of_forces_with_kinks_is_integrated_to_its_tolerance() -> None:
     for seed in range(60):
         stops = Stops(np.random.default_rng(seed).random(5))
         terms: dict[Any, Any] = {stops: None}
-        work, _ = force_work(MPI.COMM_SELF, 1, terms, {}, x0, dx, tolerance)
+        work, _ = force_work(MPI.COMM_SELF, 1, terms, {}, x0, dx, tolerance, skin=0.01)
         assert abs(work - stops.energies(x0 + dx, None).sum()) < tolerance
 
 

@@ -191,7 +191,7 @@ def crossings(trial: Trial) -> int:
         assert mesh is not None
         triangles = mesh.triangles.astype(np.int64)
         total = len(self_crossings(x, triangles))
-        for one in term.obstacles.each:
+        for one in term.obstacles.bodies:
             box = (simulation.scene.obstacles or {})[one.name].box is not None
             total += sum(map(len, find_overlaps(one, x, triangles, simulation.time, is_box=box)))
         return total

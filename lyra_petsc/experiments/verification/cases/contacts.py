@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle
 from lyra_petsc.experiments.verification.verification_case import (
@@ -241,7 +240,7 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> dict[st
     largest = np.zeros(len(names))
     with bench.simulation(content) as trial:
         equations, contact = trial.simulation.problem.equations, trial.simulation.problem.terms["contact"]
-        assert isinstance(contact, ContactBarrier)
+        assert isinstance(contact, Elastic)
         friction_term = trial.simulation.problem.terms.get("friction", contact)
         assert isinstance(friction_term, Elastic)
         below = (np.arange(len(trial.start)) < (cells + 1) ** 2)[:, None]
