@@ -127,20 +127,20 @@ class Collisions:
         return displacement[:n] if changed else None
 
     def start(
-        self, x: Array, guesses: Sequence[Array], driven: Array, free: Mask, *, pushes: bool
+        self, x: Array, guesses: Sequence[Array], driven: Array, free: Mask, *, with_obstacles: bool
     ) -> tuple[Array | None, RefusedDisplacement | None]:
         """A displacement from x, where the step begins, to its end without a collision; or None, and the
         first one that was refused.
 
-        The ``guesses`` are tried in this order, and then, with ``pushes``, with vertices moved by obstacles
-        that would hit them. Unknowns that are not ``free`` (n_owned, 3) move by ``driven`` (n_owned, 3) [m],
+        The ``guesses`` are tried in this order, and then, with ``with_obstacles``, with vertices that obstacles
+        would hit moved by these. Unknowns that are not ``free`` (n_owned, 3) move by ``driven`` (n_owned, 3) [m],
         as they must.
         """
-        trials = [(dx, pushed) for pushed in (False, True) for dx in guesses]
+        trials = [(dx, carried) for carried in (False, True) for dx in guesses]
         first = None
-        pushes &= self._barrier.obstacles.moving
-        for dx, pushed in trials if pushes else trials[: len(guesses)]:
-            moved = np.where(free, self._moved_with_obstacles(x, dx) if pushed else dx, driven)
+        with_obstacles &= self._barrier.obstacles.moving
+        for dx, carried in trials if with_obstacles else trials[: len(guesses)]:
+            moved = np.where(free, self._moved_with_obstacles(x, dx) if carried else dx, driven)
             refused = self._collision(x, moved)
             if refused is None:
                 return moved, None

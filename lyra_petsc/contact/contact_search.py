@@ -130,17 +130,17 @@ class ContactSearch:
         if dx.any() and not self._static:
             limit = max(MAX_PAIRS, MAX_PAIRS_PER_VERTEX * len(x))
         boxes = self._sheets.boxes(x, dx)
-        found = [np.empty((0, 7), dtype=np.int64)]
+        parts = [np.empty((0, 7), dtype=np.int64)]
         if self.obstacles.bodies:
-            found += self._obstacle_search.pairs(x, dx, boxes, self._walled)
+            parts += self._obstacle_search.pairs(x, dx, boxes, self._walled)
         if self._self_contact:
             radius = self.distance
             edge_radius = radius - (1.0 - EDGE_GAP) * self._gap
             pairs = self._sheets.pairs(x, dx, numbers, radius, edge_radius, boxes, limit)
             if pairs is None:
                 return None
-            found.append(pairs)
-        every = np.concatenate(found)
+            parts.append(pairs)
+        every = np.concatenate(parts)
         if len(every) > limit:
             return None
         if not len(every):

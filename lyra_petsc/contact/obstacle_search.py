@@ -65,14 +65,14 @@ class ObstacleSearch:
         low, high = patches[0].min(axis=0), patches[1].max(axis=0)
         radius = self._distance + self.deviations.max()
         obstacle_x = self.x if self._obstacles.moving else self.x[:1]
-        found = self._container_pairs(x, dx, patches, obstacle_x, radius, walled)
+        parts = self._container_pairs(x, dx, patches, obstacle_x, radius, walled)
         if self._boxes is None:
             self._boxes = obstacles.bounding_boxes(obstacle_x)
         margin = (radius + obstacles.radius[:-1])[:, None]
         lowest, highest = self._boxes
         is_near = ((lowest - margin <= high) & (highest + margin >= low)).all(axis=1)
         if not is_near.any():
-            return found
+            return parts
 
         def add_pairs(kind: int, sheet: Simplices, others: Ints, size: int, *, sheet_first: bool) -> None:
             others = others[is_near[others[:, 3]]]
@@ -91,12 +91,12 @@ class ObstacleSearch:
             own, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
             points = np.concatenate([own, theirs] if sheet_first else [theirs, own], axis=1)
             rings = others[pairs[:, 1], 4] if sheet_first else np.zeros(len(points), dtype=np.int64)
-            found.append(self._within_radius(x, dx, kind, others[pairs[:, 1], 3], points, rings))
+            parts.append(self._within_radius(x, dx, kind, others[pairs[:, 1], 3], points, rings))
 
         add_pairs(VERTEX_TRIANGLE, sheets.vertices, obstacles.triangles, 3, sheet_first=True)
         add_pairs(VERTEX_TRIANGLE, sheets.triangles, obstacles.points, 1, sheet_first=False)
         add_pairs(EDGE_EDGE, sheets.edges, obstacles.edges, 2, sheet_first=True)
-        return found
+        return parts
 
     def _container_pairs(
         self,
@@ -108,7 +108,7 @@ class ObstacleSearch:
         walled: NDArray[np.bool_],
     ) -> list[Ints]:
         """Pairs of vertices and planes, and of vertices in balls and capsules and the axis segments."""
-        found, obstacles = [], self._obstacles
+        parts, obstacles = [], self._obstacles
         for kind, others in ((VERTEX_PLANE, obstacles.planes), (VERTEX_INSIDE, obstacles.segments)):
             if not len(others):
                 continue
@@ -132,8 +132,8 @@ class ObstacleSearch:
                 number, plane = np.nonzero(close)
                 points = np.column_stack([single[number], ~others[plane, :3]])
                 zeros = np.zeros(len(points), dtype=np.int64)
-                found.append(np.column_stack([zeros + kind, others[plane, 3], points, zeros]))
-        return found
+                parts.append(np.column_stack([zeros + kind, others[plane, 3], points, zeros]))
+        return parts
 
     def _is_close(
         self, points: Array, kind: int, others: Ints, obstacle_x: Array, radius: float | Array

@@ -106,7 +106,7 @@ def find_start(equations: StageEquations) -> tuple[Array | None, RefusedDisplace
     if not equations.integrator.starts_at_rest:
         guesses.append(c * (equations.v[:n] - still))
     collisions = contact.limit(equations.step.frozen)
-    moved, refused = collisions.start(equations.x[:n], guesses, driven, free, pushes=len(guesses) > 1)
+    moved, refused = collisions.start(equations.x[:n], guesses, driven, free, with_obstacles=len(guesses) > 1)
     if moved is None:
         return None, refused
     start = still + moved / c
