@@ -96,7 +96,8 @@ class TerminalProgress(ProgressCallbacks):
         self._comm, self._usual = comm, usual
         self._progress: ProgressBar | None = None
         self._noted_cache = False
-        COMPILATION.ahead = CompilationAhead(comm.rank, comm.size)
+        if comm.size == 1:
+            COMPILATION.ahead = CompilationAhead()
         if comm.rank == 0:
             COMPILATION.first = self._announce_compilation
         self._served = served if comm.rank == 0 else None

@@ -1,4 +1,4 @@
-"""Compilation of kernels before a run calls them: on a second core, or shared among the ranks.
+"""Compilation of kernels on a second core, before a run on one rank calls them.
 
 ``signatures.txt`` has a line for each kernel of usual scenes and the types of its arguments, in the order in
 which runs first call them. ``scripts/cold_start.py --record`` writes it, and a test compares it with runs. A
@@ -27,36 +27,27 @@ def listed() -> list[Line]:
     return [(name, types) for name, _, types in (line.partition(" ") for line in text.splitlines())]
 
 
-def _compile(lines: Iterable[Line]) -> None:
-    for name, types in lines:
-        KERNELS[name].compile(normalize_signature(types)[0])  # type: ignore[no-untyped-call]
-
-
 class CompilationAhead:
     """Compiles the listed kernels of imported modules; called whenever numba starts to compile.
 
-    A single rank forks a process that compiles those first that are called last, so that both meet in the
-    middle; several ranks compile a share each.
+    It forks a process that compiles those first that are called last, so that both meet in the middle.
     """
 
-    def __init__(self, rank: int, size: int) -> None:
-        self._rank, self._size = rank, size
+    def __init__(self) -> None:
         self._waiting = listed()
         self._child: int | None = None
 
     def __call__(self) -> None:
         """Start with the kernels of modules that have been imported since the last call."""
         lines = [line for line in self._waiting if line[0] in KERNELS]
-        if not lines or self._child_is_busy():
+        one_core = hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1
+        if one_core or not lines or self._child_is_busy():
             return
         self._waiting = [line for line in self._waiting if line[0] not in KERNELS]
-        if self._size > 1:
-            _compile(lines[self._rank :: self._size])
-        elif len(os.sched_getaffinity(0)) > 1:
-            parent = os.getpid()
-            self._child = os.fork()
-            if self._child == 0:
-                _compile_in_child(reversed(lines), parent)
+        parent = os.getpid()
+        self._child = os.fork()
+        if self._child == 0:
+            _compile_in_child(reversed(lines), parent)
 
     def _child_is_busy(self) -> bool:
         with suppress(ChildProcessError):
@@ -73,6 +64,6 @@ def _compile_in_child(lines: Iterable[Line], parent: int) -> None:
         for line in lines:
             if os.getppid() != parent:
                 break
-            _compile([line])
+            KERNELS[line[0]].compile(normalize_signature(line[1])[0])  # type: ignore[no-untyped-call]
     finally:
         os._exit(0)

@@ -1,4 +1,4 @@
-"""Kernels that are compiled before they are called, by another process or by each rank its share."""
+"""Kernels that another process compiles before they are called."""
 
 import os
 import sys
@@ -14,7 +14,7 @@ from lyra_petsc.kernels.ahead import listed
 ROOT = Path(__file__).parents[2]
 
 PROGRAM = """
-import os, sys
+import os
 from lyra_petsc.kernels import ahead
 from lyra_petsc.kernels.cache import KERNELS, cached
 from lyra_petsc.kernels.compilation import COMPILATION
@@ -34,10 +34,9 @@ def third(x):
 names = "first", "second", "third", "of_another_scene"
 ahead.listed = lambda: [(f"__main__:{name}", "(float64,)") for name in names]
 os.sched_getaffinity = lambda process: {0, 1}
-COMPILATION.ahead = ahead.CompilationAhead(*map(int, sys.argv[1:]))
+COMPILATION.ahead = ahead.CompilationAhead()
 assert first(1.0) == 2.0
-if COMPILATION.ahead._child:
-    assert os.waitpid(COMPILATION.ahead._child, 0)[1] == 0
+assert os.waitpid(COMPILATION.ahead._child, 0)[1] == 0
 compiled_here = [name for name in names[:3] if KERNELS[f"__main__:{name}"].stats.cache_misses]
 assert (second(1.0), third(1.0)) == (3.0, 4.0)
 loaded = [name for name in names[:3] if KERNELS[f"__main__:{name}"].stats.cache_hits]
@@ -45,19 +44,13 @@ print(*compiled_here, "|", *loaded)
 """
 
 
-@pytest.mark.parametrize(
-    ("rank", "size", "kernels"),
-    [(0, 1, "first | second third"), (0, 2, "first third |"), (1, 2, "first second |")],
-)
-def test_one_rank_leaves_kernels_to_another_process_and_several_share_them(
-    rank: int, size: int, kernels: str, tmp_path: Path
-) -> None:
+def test_another_process_compiles_what_is_called_later(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(textwrap.dedent(PROGRAM))
     variables = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(ROOT)}
-    done = run_program([sys.executable, program, str(rank), str(size)], env=variables, seconds=100)
+    done = run_program([sys.executable, program], env=variables, seconds=100)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == kernels
+    assert done.stdout.strip() == "first | second third"
 
 
 @pytest.mark.slow
