@@ -167,15 +167,15 @@ class EnergyBalance:
 
     def measure(self) -> None:
         """Write the energies of the present state into the budget."""
-        self.budget, self._moving_energy, _ = self._measured(self.budget)
+        entries, self._moving_energy, _ = self._measured()
+        self.budget = replace(self.budget, **entries)
 
-    def _measured(self, works: Budget, *local: float) -> tuple[Budget, float, list[float]]:
-        """Energies of the present state with the ``works`` so far, the energy of the terms with moving
+    def _measured(self, *local: float) -> tuple[dict[str, Any], float, list[float]]:
+        """Energies of the present state as entries of a `Budget`, the energy of the terms with moving
         targets, and the sums of ``local`` over ranks.
         """
-        equations = self._equations
-        n, names = equations.points.n_owned, [*ENERGIES, *self._columns]
-        energies, moving = dict.fromkeys(names, 0.0), 0.0
+        equations, moving = self._equations, 0.0
+        energies = dict.fromkeys([*ENERGIES, *self._columns], 0.0)
         for term in equations.active.elastic:
             if name := term.registration.energy:
                 frozen = equations.step.frozen[term]
@@ -186,20 +186,14 @@ class EnergyBalance:
         for load in equations.active.loads:
             if name := load.registration.energy:
                 energies[name] += load.potential(equations.x)
-        kinetic = kinetic_energy(equations.mass, equations.v[:n])
-        sums = equations.points.global_sum(*energies.values(), kinetic, moving, *local).tolist()
-        count = len(names)
-        membrane, bending, potential, *more = sums[:count]
+        energies["kinetic"] = kinetic_energy(equations.mass, equations.v[: equations.points.n_owned])
+        sums = equations.points.global_sum(*energies.values(), moving, *local).tolist()
         equations.directors.forget()  # the next step has other frames
-        budget = replace(
-            works,
-            kinetic=sums[count],
-            membrane=membrane,
-            bending=bending,
-            potential=potential,
-            more=dict(zip(self._columns, more, strict=True)),
-        )
-        return budget, sums[count + 1], sums[count + 2 :]
+        every = dict(zip(energies, sums, strict=False))
+        more = {name: every.pop(name) for name in self._columns}
+        entries = {name.removesuffix("_energy"): energy for name, energy in every.items()} | {"more": more}
+        moving, *local_sums = sums[len(energies) :]
+        return entries, moving, local_sums
 
     def enter(self, account: StepAccount) -> None:
         """Take the account of a step that is accepted into the books."""
@@ -234,15 +228,13 @@ class EnergyBalance:
         inertia = kinetic_energy(equations.mass, equations.stage_velocity - equations.step.v_h)
         before, moving_before = self.budget, self._moving_energy
         local = work, damped, fabric, impacts, by_obstacles, at_start, inertia
-        energies, moving, sums = self._measured(before, *local)
+        energies, moving, sums = self._measured(*local)
         work, damped, fabric, impacts, by_obstacles, at_start, inertia = sums
         if self._ends is None:  # a handle does work on the sheet through targets that move with it
             work -= moving_before
         heat = damped + fabric + impacts
-        after = replace(
-            energies,
-            external_work=before.external_work + work,
-            dissipation=before.dissipation + heat,
+        after = Budget(
+            **energies, external_work=before.external_work + work, dissipation=before.dissipation + heat
         )
         works = work, by_obstacles, at_start
         self.account = StepAccount(

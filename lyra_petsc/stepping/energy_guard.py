@@ -377,7 +377,7 @@ class EnergyGuard:
         accepted = of_step <= max(max_gain * new.scale, step.noise)
         # repeating a step without a gain would not reduce the sum
         accepted &= of_steps <= max(max_sum * new.scale, new.noise) or new.recent[-1] <= step.noise
-        accepted = bool(self._equations.points.comm.bcast(accepted, root=0))
+        accepted = not any(self._equations.points.global_max(not accepted))  # the same on all ranks
         if accepted:
             self.gains = new
             self._forces.keep_end()

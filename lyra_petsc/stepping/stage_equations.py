@@ -144,7 +144,7 @@ class StageEquations:
 
     def change(self, **changes: Any) -> None:
         """Go on with another step, with these entries changed: what has been evaluated holds no longer."""
-        self.step = replace(self.step, **changes)
+        self.step = self.step.changed(**changes)
 
     def return_to(self, step: TimeStep) -> None:
         """Go on with a step that another has interrupted."""
@@ -203,8 +203,7 @@ class StageEquations:
         x, lagged, step = self.frozen_positions(at), self.integrator.lagged_loads, self.step
         frozen = self.active.freeze(self.targets_at(at, x))
         self.directors.begin_step()
-        known = self.state.evaluation
-        terms = self.active.with_edges
+        known, terms = self.state.evaluation, self.active.with_edges
         if known and any(frozen[term].number != known.step.frozen[term].number for term in terms):
             self.state.evaluation = None  # its forces are those with other frames
         viscous = self.active.viscous if lagged else []

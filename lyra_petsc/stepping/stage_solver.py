@@ -33,7 +33,7 @@ from lyra_petsc.stepping.newton.inexact import CAREFUL, COLLIDING, LOOSEST, TIGH
 from lyra_petsc.stepping.newton.initial_guess import first_guess
 from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
-from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Trace
+from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Iteration, Trace
 from lyra_petsc.stepping.newton.snes_callbacks import NewtonCallbacks
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.time_step import Evaluation
@@ -138,7 +138,7 @@ class StageSolver:
         )
         self.ksp.setType(PETSc.KSP.Type.CG)
         self.ksp.setTolerances(max_it=5000)
-        self._trace = Trace(self.snes, equations, lambda: newton.linear_iterations)
+        self._trace = Trace(self.snes, points, lambda: newton.linear_iterations)
         self._set_monitors_and_tolerances(scene, floor)
         # objects that PETSc frees after Python has ended must not call Python
         self._at_exit = weakref.finalize(self, _remove_python_types, self.ksp)
@@ -336,12 +336,13 @@ class StageSolver:
 
     def failed_solve(self) -> FailedSolve:
         """The state of the solve that just failed; collective, before the next step begins."""
-        return self._trace.failed_solve()
+        return _failed_solve(self._equations, self.snes, self._trace.iterations)
 
     def solve_without_start(self) -> FailedSolve:
         """The same of a solve that cannot begin, where the step starts; collective."""
         self._trace.begin_solve()
-        return self._trace.failed_solve(self._equations.stationary_velocity())
+        start = self._equations.stationary_velocity()
+        return _failed_solve(self._equations, self.snes, self._trace.iterations, start)
 
     # -- callbacks -----------------------------------------------------------------------------------
 
@@ -369,7 +370,8 @@ class StageSolver:
     ) -> bool:
         self.newton.assemble(u)
         if self._iterates:
-            self.newton.globalisation.note_iterate(u)
+            kinks = self._equations.has_active_pairs and self._equations.integrator.dynamic
+            self.newton.globalisation.note_iterate(u, kinks=kinks)
         return True
 
     def _update(self, snes: PETSc.SNES, iteration: int) -> None:
@@ -378,6 +380,37 @@ class StageSolver:
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self.newton.globalisation.begin_solve()
         self._follow_stencils()
+
+
+def _failed_solve(
+    equations: StageEquations,
+    snes: PETSc.SNES,
+    iterations: Sequence[Iteration],
+    velocity: Array | None = None,
+) -> FailedSolve:
+    """The state of a solve that failed, or could not begin at ``velocity`` (n_owned, 3) [m/s]; collective."""
+    step, n, ksp = equations.step, equations.points.n_owned, snes.getKSP()
+    if velocity is None:
+        velocity = snes.getSolution().getArray(readonly=True).reshape(n, 3).copy()
+    residual = equations.residual_at(velocity)
+    position = (equations.x[:n] if step.stage.x is None else step.stage.x) + step.stage.c * velocity
+    if equations.held and equations.integrator.handles_at_stage:
+        there = equations.prescriptions.positions(step.start, step.end, step.at_stage, equations.x)
+        step.prescribed.overwrite(position, there.take(step.prescribed.indices))
+    (square,) = equations.points.global_sum(float(np.vdot(residual, residual)))
+    return FailedSolve(
+        tuple(iterations),
+        float(np.sqrt(square)),
+        step.at_stage,
+        velocity,
+        position,
+        residual,
+        dict(equations.forces_at_stage()),
+        step.prescribed.mask[:n].copy(),
+        int(snes.getConvergedReason()),
+        int(ksp.getConvergedReason()),
+        np.array(ksp.getConvergenceHistory()),
+    )
 
 
 def _remove_python_types(ksp: PETSc.KSP) -> None:

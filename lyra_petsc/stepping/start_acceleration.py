@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -96,7 +95,7 @@ class StartAcceleration:
         if active.moving or active.external:
             # at the stage targets are farther, and an obstacle may be where the sheet still is now
             there = step.upcoming(step.start, x, self._prescriptions.reference)
-            step = replace(step, frozen=active.with_targets(step.frozen, there))
+            step = step.changed(frozen=active.with_targets(step.frozen, there))
         if forces.damps and layout.n_edges_global:
             self._balance_moments(step, v)
         force = self._out_of_balance(step, v)

@@ -75,6 +75,12 @@ class TimeStep:
     of_edges: bool = False
     number: int = field(default_factory=lambda: next(_numbers), init=False)
 
+    def changed(self, **changes: Any) -> TimeStep:
+        """Another step with these entries; several times as fast as `dataclasses.replace`."""
+        other = object.__new__(TimeStep)
+        other.__dict__.update(self.__dict__, **changes, number=next(_numbers))
+        return other
+
     @property
     def dt(self) -> float:
         """Length [s]."""

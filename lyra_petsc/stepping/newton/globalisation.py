@@ -11,7 +11,6 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.iterates import Iterates
-from lyra_petsc.stepping.stage_equations import StageEquations
 
 PATIENCE = 5
 """Number of iterations without a new lowest energy after which full steps end."""
@@ -118,21 +117,12 @@ class Globalisation:
     Parameters
     ----------
     snes : PETSc.SNES
-    equations : StageEquations
     iterates : Iterates
     convergence : Convergence
     """
 
-    def __init__(
-        self, snes: PETSc.SNES, equations: StageEquations, iterates: Iterates, convergence: Convergence
-    ) -> None:
-        self._snes, self._equations, self._iterates, self._convergence = (
-            snes,
-            equations,
-            iterates,
-            convergence,
-        )
-        self._shape = (equations.points.n_owned, 3)
+    def __init__(self, snes: PETSc.SNES, iterates: Iterates, convergence: Convergence) -> None:
+        self._snes, self._iterates, self._convergence = snes, iterates, convergence
         self._watchdog = Watchdog()
         self._first_energy = -math.inf
         self.begin_solve()
@@ -143,13 +133,15 @@ class Globalisation:
         self._slope, self._returns, self._near_kinks = 0.0, False, False
         self._watchdog.begin_solve()
 
-    def note_iterate(self, u: PETSc.Vec) -> None:
-        """Note energy and residual of iterate u, with which trial points are compared; collective."""
+    def note_iterate(self, u: PETSc.Vec, *, kinks: bool) -> None:
+        """Note energy and residual of iterate u, with which trial points are compared; collective.
+
+        ``kinks``: contact acts in a motion. In statics, where steps are long, line searches would progress
+        slowly.
+        """
         self._energy = self._iterates.at(u).objective
         self._norm = self._snes.getFunctionNorm()
-        # near equilibrium energy differences are round-off; in statics, where steps are long, line searches
-        # would progress slowly
-        kinks = self._equations.has_active_pairs and self._equations.integrator.dynamic
+        # near equilibrium energy differences are round-off
         self._near_kinks = kinks and not self._convergence.balanced
         energy, size = self._energy
         if self._snes.getIterationNumber() == 0:
@@ -164,7 +156,7 @@ class Globalisation:
         best = self._watchdog.best
         if best is None or not self._watchdog.energy < self._first_energy:
             return None
-        iterate: Array = best.getArray(readonly=True).reshape(self._shape).copy()
+        iterate: Array = best.getArray(readonly=True).reshape(-1, 3).copy()
         return iterate
 
     def return_to_best(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
@@ -172,7 +164,6 @@ class Globalisation:
         self._returns = self._watchdog.must_return
         if self._returns:
             self._watchdog.return_to_best(x, y)
-            self._equations.predicted_stress.forget()
         return self._returns
 
     @property
@@ -198,8 +189,8 @@ class Globalisation:
         noise = ENERGY_ROUNDOFF * max(size, own_size)
         if value == here or not abs(value - here) < noise:
             return value
-        equations, trial = self._equations, np.empty(self._shape)
-        equations.forces.residual(u.getArray(readonly=True).reshape(self._shape), at, trial)
-        (square,) = equations.points.global_sum(float(np.vdot(trial, trial)))
+        v = u.getArray(readonly=True).reshape(-1, 3)
+        at.forces.residual(v, at, trial := np.empty_like(v))
+        (square,) = at.forces.layout.global_sum(float(np.vdot(trial, trial)))
         smaller = bool(np.sqrt(square) < self._norm)
         return here - noise if smaller else here + noise

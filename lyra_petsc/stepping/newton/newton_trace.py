@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.mesh.points import Layout
 
 
 @dataclass(frozen=True)
@@ -87,24 +87,27 @@ class Trace:
     Parameters
     ----------
     snes : PETSc.SNES
-    equations : StageEquations
+    points : Layout
     linear_iterations : callable
         Returns the number of linear iterations of the present solve so far.
+
+    Attributes
+    ----------
+    iterations : list of Iteration
+        Those of the present solve.
     """
 
-    def __init__(
-        self, snes: PETSc.SNES, equations: StageEquations, linear_iterations: Callable[[], int]
-    ) -> None:
-        self._snes, self._ksp, self._equations = snes, snes.getKSP(), equations
+    def __init__(self, snes: PETSc.SNES, points: Layout, linear_iterations: Callable[[], int]) -> None:
+        self._ksp, self._points = snes.getKSP(), points
         self._linear_iterations = linear_iterations
-        self._iterations: list[Iteration] = []
+        self.iterations: list[Iteration] = []
         self._linear = 0
         self._last: Array | None = None
         self._ksp.setConvergenceHistory(reset=True)
 
     def begin_solve(self) -> None:
         """Forget the last solve."""
-        self._iterations, self._linear, self._last = [], 0, None
+        self.iterations, self._linear, self._last = [], 0, None
 
     def monitor(self, snes: PETSc.SNES, number: int, norm: float) -> None:
         """Record the present iterate; for ``SNES.setMonitor``; collective."""
@@ -113,40 +116,10 @@ class Trace:
         taken = None
         if number > 0 and self._last is not None:
             increment = here - self._last
-            (square,) = self._equations.points.global_sum(float(np.vdot(increment, increment)))
+            (square,) = self._points.global_sum(float(np.vdot(increment, increment)))
             moved = np.sqrt(square)
             length = snes.getSolutionUpdate().norm()
             taken = float(moved / length) if length > 0.0 else 0.0
         reason = int(self._ksp.getConvergedReason()) if number > 0 else 0
-        self._iterations.append(Iteration(norm, linear - self._linear, reason, taken))
+        self.iterations.append(Iteration(norm, linear - self._linear, reason, taken))
         self._linear, self._last = linear, here
-
-    def failed_solve(self, velocity: Array | None = None) -> FailedSolve:
-        """The state of the solve that just failed; collective, before the next step begins.
-
-        If a solve could not begin, ``velocity`` (n_owned, 3) [m/s] is its starting point.
-        """
-        equations, stage = self._equations, self._equations.step.stage
-        n = equations.points.n_owned
-        if velocity is None:
-            velocity = self._snes.getSolution().getArray(readonly=True).reshape(n, 3).copy()
-        residual = equations.residual_at(velocity)
-        position = (equations.x[:n] if stage.x is None else stage.x) + stage.c * velocity
-        if equations.held and equations.integrator.handles_at_stage:
-            step, held = equations.step, equations.step.prescribed
-            there = equations.prescriptions.positions(step.start, step.end, step.at_stage, equations.x)
-            held.overwrite(position, there.take(held.indices))
-        (square,) = equations.points.global_sum(float(np.vdot(residual, residual)))
-        return FailedSolve(
-            tuple(self._iterations),
-            float(np.sqrt(square)),
-            equations.step.start + stage.offset,
-            velocity,
-            position,
-            residual,
-            dict(equations.forces_at_stage()),
-            equations.step.prescribed.mask[:n].copy(),
-            int(self._snes.getConvergedReason()),
-            int(self._ksp.getConvergedReason()),
-            np.array(self._ksp.getConvergenceHistory()),
-        )

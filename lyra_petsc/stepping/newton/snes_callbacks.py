@@ -76,7 +76,7 @@ class NewtonCallbacks:
         self._linear, self._convexity, self._points, self._iterates = linear, convexity, points, iterates
         self.convergence, self.globalisation = (
             convergence,
-            Globalisation(snes, equations, points, convergence),
+            Globalisation(snes, points, convergence),
         )
         self._shape = (equations.points.n_owned, 3)
         self._follow, contact = follow, equations.contact
@@ -157,6 +157,7 @@ class NewtonCallbacks:
         for ``SNESLineSearch.setPreCheck``.
         """
         if self.globalisation.return_to_best(x, y):
+            self._equations.predicted_stress.forget()
             return True
         changed = False
         residual = self._snes.getFunction()[0]
