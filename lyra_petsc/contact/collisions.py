@@ -132,8 +132,8 @@ class Collisions:
         """A displacement from x, where the step begins, to its end without a collision; or None, and the
         first one that was refused.
 
-        The ``guesses`` are tried in this order, and then, ``with_obstacles``, once more with vertices moved by
-        obstacles that would hit them. Unknowns that are not ``free`` (n_owned, 3) move by ``driven``
+        The ``guesses`` are tried in this order, and then, ``with_obstacles``, once more with vertices moved
+        by obstacles that would hit them. Unknowns that are not ``free`` (n_owned, 3) move by ``driven``
         (n_owned, 3) [m], as they must.
         """
         trials = [(dx, carried) for carried in (False, True) for dx in guesses]
