@@ -204,15 +204,13 @@ class SteppedScene:
         SolverError
             If no way to repeat it is left; the state is then that before the step.
         """
-        started = clock.perf_counter() - COMPILATION.seconds
-        equations = self.problem.equations
+        started, equations = clock.perf_counter() - COMPILATION.seconds, self.problem.equations
         x_before, v_before = equations.x, equations.v
         v_owned = v_before[: self.problem.points.n_owned]
         newton = linear = rejected = gains = 0
         jumps, failed = False, []
-        equations.integrators.take(
-            equations.integrators.in_contact if equations.touches else equations.integrators.usual
-        )
+        touches, integrators = equations.contact_before.touches, equations.integrators
+        integrators.take(integrators.in_contact if touches or equations.nears_limit else integrators.usual)
         while True:
             end = self.control.next_end(self.time)
             dt, histories = end - self.time, self._histories()
@@ -233,7 +231,7 @@ class SteppedScene:
             gains += trouble is Trouble.GAIN
             rejected += 1
         self.last_integrator = equations.integrator
-        usual, in_contact = equations.integrators.usual, equations.integrators.in_contact
+        usual, in_contact = integrators.usual, integrators.in_contact
         if equations.integrator is in_contact is not usual and usual.iterates:
             text = f"{in_contact.name} takes the steps in which something touches or nears a limit"
             self.run_notes.once("in contact", text)

@@ -58,12 +58,8 @@ class StageEquations:
         The present one, or the last.
     evaluated : Evaluation
         The last one; after a step that of its stage.
-    load_case : LoadCase
-        That of the next step.
-    forces, active, damping, directors, prescriptions, reference, start_acceleration : parts
-    predicted_stress : PredictedStress
-        That of the Jacobian.
-    integrators : IntegratorsInUse
+    load_case, forces, active, damping, directors, prescriptions, reference, integrators : parts
+    predicted_stress, start_acceleration : parts
     nears_limit : bool
         Whether a term that limits steps acts at the positions of the state; contact is apart.
     has_active_pairs : bool
@@ -340,8 +336,6 @@ class StageEquations:
         """
         return self.evaluate(v).x, self.points.extended(increment * self.step.stage.c)
 
-    # -- contact -------------------------------------------------------------------------------------
-
     def _finished(self) -> StepEnd:
         """The end of the step, at the state."""
         return self.step.finished(self.points, self.mass, self.x, self.v, self.integrator.order)
@@ -355,11 +349,6 @@ class StageEquations:
     def near(self) -> bool:
         """Whether any parts are near each other."""
         return self.contact is not None and self.contact.near
-
-    @property
-    def touches(self) -> bool:
-        """Whether anything touches, or a term acts that limits steps, at the positions of the state."""
-        return self.nears_limit or self.contact_before.touches
 
     def _follow_ghosts(self) -> None:
         """Resize all arrays to the layout's present ghosts; collective."""
