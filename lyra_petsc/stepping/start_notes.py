@@ -87,7 +87,8 @@ def nothing_holds(
         vertices = select_vertices(mesh, handle, key=f"handles[{number}]", file=scene.source)
         held[np.ix_(np.unique(piece[vertices]), handle.axis_numbers)] = True
     sums, sizes = (
-        np.column_stack([np.bincount(piece, parts) for parts in each.T]) for each in (force, np.abs(force))
+        np.column_stack([np.bincount(piece, parts) for parts in vectors.T])
+        for vectors in (force, np.abs(force))
     )
     free = ~held & (np.abs(sums) > BALANCED * sizes.sum(axis=1, keepdims=True))
     notes = []
