@@ -1,4 +1,4 @@
-"""Time of a scene's first run, from an empty cache of kernels: ``cold_start.py SCENE [--set KEY=VALUE …]``.
+"""Time of a scene's first run, from an empty cache of kernels: ``cold_start.py SCENE [KEY=VALUE …]``.
 
 ``--record`` writes the list of kernels that are compiled ahead, with those of the scenes in `RECORDED`.
 """
