@@ -95,10 +95,12 @@ class StartAcceleration:
         if active.moving or active.external:
             # at the stage targets are farther, and an obstacle may be where the sheet still is now
             there = step.upcoming(step.start, x, self._prescriptions.reference)
-            step = step.changed(frozen=active.with_targets(step.frozen, there))
+            at_start = step.changed(frozen=active.with_targets(step.frozen, there))
+        else:
+            at_start = step
         if forces.damps and layout.n_edges_global:
-            self._balance_moments(step, v)
-        force = self._out_of_balance(step, v)
+            self._balance_moments(at_start, v)
+        force = self._out_of_balance(at_start, v)
         acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
         start = step.finished(layout, forces.mass, state.x, v, self._integrators.present.order)
         for term in active.sliding if self._contact is not None and self._contact.near else ():
