@@ -423,10 +423,10 @@ class EnergyGuard:
         of_step, of_steps, scale = self._judged
         if not (math.isfinite(scale) and math.isfinite(of_step)):
             return "makes energy without bounds"
-        share, what = of_step / scale, ""
+        share, period = of_step / scale, ""
         if share <= LARGEST_GAIN and of_steps > of_step:
-            share, what = of_steps / scale, " in the steps so far"
-        return f"makes {100.0 * share:.2g} % of the energy at work out of nothing{what}"
+            share, period = of_steps / scale, " in the steps so far"
+        return f"makes {100.0 * share:.2g} % of the energy at work out of nothing{period}"
 
     @property
     def remedy(self) -> str:

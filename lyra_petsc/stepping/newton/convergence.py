@@ -16,7 +16,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 
 Reason = PETSc.SNES.ConvergedReason
 
-FAST = 0.1
+TENFOLD = 0.1
 """The preconditioner is kept after an iteration that leaves less than this fraction of the residual."""
 
 HALVED = 0.5
@@ -51,7 +51,7 @@ class Convergence:
     ----------
     norm : float
         Last residual norm [N].
-    fell_fast : bool
+    fell_tenfold : bool
         Whether the last iteration reduced the residual tenfold.
     halved : bool
         Whether the last iteration halved the residual.
@@ -86,7 +86,7 @@ class Convergence:
 
     def begin_solve(self) -> None:
         """Prepare for a new solve."""
-        self.norm, self.fell_fast, self.at_roundoff, self._floor = 0.0, False, False, self._minimum_floor
+        self.norm, self.fell_tenfold, self.at_roundoff, self._floor = 0.0, False, False, self._minimum_floor
         self.halved = True
         self.remaining, self.too_slow, self.stopped_by = np.inf, False, ""
         self._first_norm = self._increment = 0.0
@@ -128,7 +128,7 @@ class Convergence:
 
     def _test(self, snes: PETSc.SNES, iteration: int, residual: float, linear_iterations: int) -> int | None:
         before, self.norm = self.norm, residual
-        self.fell_fast = residual < FAST * before
+        self.fell_tenfold = residual < TENFOLD * before
         self.halved = iteration == 0 or residual < HALVED * before
         if not np.isfinite(residual):
             return NOT_A_NUMBER
@@ -216,7 +216,7 @@ class Convergence:
         The ratio is used only if the residual fell fast (Hairer & Wanner, Solving Ordinary Differential
         Equations II, equation IV.8.10). An estimate from corrections is better and replaces a larger one.
         """
-        fell = increment / self._increment if self.fell_fast and self._increment > 0.0 else 1.0
+        fell = increment / self._increment if self.fell_tenfold and self._increment > 0.0 else 1.0
         self._increment = increment
         self.remaining = increment * (fell / (1.0 - fell) if fell < HALVED else 1.0)
         self.remaining, self._after_correction = min(self.remaining, self._after_correction), np.inf

@@ -41,13 +41,13 @@ BUCKLING = 1e-5
 """Tolerance in steps in which the Hessian is indefinite while parts are near: the sheet buckles into one of
 several shapes, and the error of looser solves decides into which."""
 
-SLOW = 0.3
+TIGHTEN = 0.3
 """After an iteration that leaves more than this fraction of the residual, the tolerance is tightened."""
 
-SLOW_IN_CONTACT = 0.7
+TIGHTEN_IN_CONTACT = 0.7
 """The same where parts are near: residuals also fall slowly when contacts open or close."""
 
-FAST = 0.03
+LOOSEN = 0.03
 """After an iteration that leaves less than this fraction, the tolerance is loosened."""
 
 
@@ -76,7 +76,7 @@ class Forcing:
         Says whether parts are near in the step, whether they collide, and whether the Hessian may be
         indefinite at its start.
         """
-        self._slow = SLOW_IN_CONTACT if near else SLOW
+        self._tighten_above = TIGHTEN_IN_CONTACT if near else TIGHTEN
         self._loosest = LOOSEST_IN_CONTACT if near and not self._cycles else LOOSEST
         self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = 0.0
@@ -110,9 +110,9 @@ class Forcing:
         if self._fixed:
             return
         norm = convergence.norm
-        if self._norm > 0.0 and norm > self._slow * self._norm:
+        if self._norm > 0.0 and norm > self._tighten_above * self._norm:
             self.tolerance = max(TIGHTEST, 0.1 * self.tolerance)
-        elif norm < FAST * self._norm:
+        elif norm < LOOSEN * self._norm:
             self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm, tolerance = norm, self.effective_tolerance
         if self._near and self._buckles:

@@ -128,7 +128,7 @@ class NewtonCallbacks:
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         exact = self._full_steps is not None and self.convergence.halved
         convexity = self._convexity.after(self._taken(u), exact=exact)
-        keep = self.convergence.fell_fast
+        keep = self.convergence.fell_tenfold
         by_prescribed = self._linear.assemble(at, convexity, keep=keep, convex=self._convex)
         if by_prescribed is not None:
             force = self._snes.getFunction()[0].getArray().reshape(self._shape)
@@ -268,7 +268,7 @@ class NewtonCallbacks:
         equations, v = self._equations, self._array(x)
         shortened = self._limit_displacement(y)
         fraction = limits.largest_step(equations, v, -self._array(y))
-        slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_fast
+        slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_tenfold
         correct = fraction < 1.0 or slow
         separated = limits.separated(equations, v, -self._array(y)) if correct else None
         if separated is not None and descends(residual, separated, equations.points):
