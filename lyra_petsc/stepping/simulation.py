@@ -37,7 +37,7 @@ from lyra_petsc.stepping.statics.equilibrium import Equilibrium
 from lyra_petsc.stepping.statics.stability import Stability
 from lyra_petsc.stepping.step_control import ToleranceControl
 from lyra_petsc.stepping.step_plan import planned_control
-from lyra_petsc.stepping.stepper import WOULD_CROSS, Attempt, Stepper
+from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.term_states import ElementState
 from lyra_petsc.stepping.ts_options import with_ts_options
 from lyra_petsc.terms.protocols import Dissipates
@@ -268,7 +268,7 @@ class SteppedScene:
         if not attempt.converged:
             if attempt.touches:
                 return Trouble.TOUCHING
-            return Trouble.CROSSING if attempt.message.startswith(WOULD_CROSS) else Trouble.UNSOLVED
+            return Trouble.CROSSING if attempt.crosses else Trouble.UNSOLVED
         equations, n = self.problem.equations, self.problem.points.n_owned
         if not limits.is_resolved(equations):
             return Trouble.UNRESOLVED

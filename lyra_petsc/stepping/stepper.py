@@ -51,6 +51,8 @@ class Attempt:
         A displacement that collides, where the step has no start without a collision.
     touches : bool
         Whether it failed because something touches in a step without contact in its equations.
+    crosses : bool
+        Whether it failed because the step has no start without a collision.
     failed_solve : FailedSolve or None
         The last iterate and residual of a failed attempt.
     """
@@ -64,6 +66,7 @@ class Attempt:
     at_roundoff: bool = False
     refused: RefusedDisplacement | None = None
     touches: bool = False
+    crosses: bool = False
     failed_solve: FailedSolve | None = None
 
 
@@ -204,9 +207,11 @@ class Stepper:
         number = solver.ts.getStepNumber()
         start, refused = limits.find_start(equations)
         if start is None or not has_start(equations, start):
-            message = WOULD_CROSS if start is None else BEYOND_LIMIT
-            failed = solver.solve_without_start()
-            return Attempt(False, 0, 0, math.inf, message=message, refused=refused, failed_solve=failed)
+            crosses = start is None
+            message, failed = WOULD_CROSS if crosses else BEYOND_LIMIT, solver.solve_without_start()
+            return Attempt(
+                False, 0, 0, math.inf, message=message, refused=refused, crosses=crosses, failed_solve=failed
+            )
         solves = [solver.solve(start)]
         while self._iterates and len(solves) < MAX_SOLVES and (reached := solves[-1].evaluation) is not None:
             if not limits.follow_contacts(equations, reached):
