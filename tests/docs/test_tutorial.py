@@ -20,5 +20,4 @@ def test_the_report_has_no_advice_on_the_tutorial(tmp_path: Path) -> None:
     facts = Facts.of(run)
     assert facts.summary["notes"] == []
     columns = facts.columns | {"wall_seconds": np.ones_like(facts.columns["wall_seconds"])}
-    summary = facts.summary | {"ranks": 2, "wall_seconds": {"solve": 1.0}}
-    assert advice(Facts(run, columns, summary)) == []
+    assert advice(Facts(run, columns)) == []

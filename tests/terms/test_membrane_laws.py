@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -49,21 +51,40 @@ stable = pytest.mark.parametrize("keys", MATERIALS[1:], ids=lambda keys: "-".joi
 STRAINS = [np.array(e) for e in product((-0.35, -0.1, 0.0, 0.08, 0.4), (-0.3, 0.02, 0.3), (-0.25, 0.0, 0.15))]
 
 
+@cache
+def compiled(name: str) -> Any:
+    """Energy, stress and tangent of a law, compiled as in kernels."""
+    law = law_of(name)
+    energy, stress, tangent = law.energy, law.stress, law.tangent
+
+    @numba.njit
+    def all_of(e, c):  # type: ignore[no-untyped-def]
+        n = Index(0)
+        first, second, third = e[0], e[1], e[2]
+        return (
+            energy(first, second, third, c, n),
+            stress(first, second, third, c, n),
+            tangent(first, second, third, c, n),
+        )
+
+    return all_of
+
+
 class Law:
     """A material's energy, stress and tangent as functions of e (3,)."""
 
     def __init__(self, shell: ShellMaterial) -> None:
-        self._law = law_of(shell.law)
-        self._c = np.array([self._law.parameters(shell)])
+        self._law = compiled(shell.law)
+        self._c = np.array([law_of(shell.law).parameters(shell)])
 
     def energy(self, e: Array) -> float:
-        return float(self._law.energy(*e, self._c, Index(0)))
+        return float(self._law(e, self._c)[0])
 
     def stress(self, e: Array) -> Array:
-        return np.array(self._law.stress(*e, self._c, Index(0)))
+        return np.array(self._law(e, self._c)[1])
 
     def tangent(self, e: Array) -> Array:
-        c11, c12, c22, c33, c13, c23 = self._law.tangent(*e, self._c, Index(0))
+        c11, c12, c22, c33, c13, c23 = self._law(e, self._c)[2]
         return np.array([[c11, c12, c13], [c12, c22, c23], [c13, c23, c33]])
 
 

@@ -188,8 +188,8 @@ class Motion:
         for i, turn in enumerate(turns):
             axis, angle = _relative_rotation(self._values[i, 6:], self._values[i + 1, 6:])
             if turn is not None:
-                axes = [own for own in map(_axis, keyframes[i : i + 2]) if own is not None]
-                axis, angle = axes[0] if axes else axis, math.radians(turn)
+                of_keys = [own for own in map(_axis, keyframes[i : i + 2]) if own is not None]
+                axis, angle = of_keys[0] if of_keys else axis, math.radians(turn)
             axes.append(axis)
             angles.append(angle)
         if not self._linear:
