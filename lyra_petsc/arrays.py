@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,3 +21,14 @@ def read_only(values: Array) -> Array:
     view = values.view()
     view.flags.writeable = False
     return view
+
+
+def unwritable(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """The arrays, made read-only.
+
+    Kernels are compiled separately for read-only arrays, so that arrays used in place of results that are
+    kept must be read-only, too.
+    """
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays

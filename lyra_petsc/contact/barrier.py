@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array, Ints, unwritable
 from lyra_petsc.contact import contact_pairs, one_sided, pair_distances, pair_motion
 from lyra_petsc.contact.barrier_law import barrier as barrier_law
 from lyra_petsc.contact.barrier_pairs import barrier_pairs
@@ -27,10 +27,10 @@ from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles
 from lyra_petsc.contact.one_sided import Springs
 from lyra_petsc.contact.pair_distances import EDGE_EDGE
 from lyra_petsc.contact.pairs import Contacts, NearPairs, chosen, no_near_pairs
+from lyra_petsc.contact.position_cache import PositionCache
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.position_cache import PositionCache, unwritable
 from lyra_petsc.terms.protocols import KEPT_FRACTION, LimitsStep
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Assembly, UpcomingStep

@@ -145,6 +145,7 @@ class Trial:
                 problem.equations.x.reshape(-1)[term.edge_indices[own]] = directors[own]
                 problem.points.update_ghosts(problem.equations.x)
                 problem.equations.refreeze({term: term.frames})
+        problem.equations.state.forget()
         self.simulation.energy_balance.measure()  # the next step compares its energies with these
         if self.simulation.guard is not None:
             self.simulation.guard.forget_end()

@@ -17,10 +17,10 @@ from lyra_petsc.stepping.problem import Problem
 if TYPE_CHECKING:
     from lyra_petsc.terms.bending.hinge import Bending
     from lyra_petsc.terms.bending.midedge import MidEdge
-    from lyra_petsc.terms.bending.midedge_shape import Frames
+    from lyra_petsc.terms.protocols import Located
 
-    OnHinges = Callable[[Bending, "Array"], "Array"]
-    OnTriangles = Callable[[MidEdge, "Array", Frames], "Array"]
+    OnHinges = Callable[[Bending, "Array", Located], "Array"]
+    OnTriangles = Callable[[MidEdge, "Array", Located], "Array"]
 
 Ints = NDArray[np.int32]
 
@@ -69,14 +69,14 @@ def _bending_density(problem: Problem, of_hinges: OnHinges, of_triangles: OnTria
 
     A hinge's value is divided between the two ends of its edge, a triangle's among its three corners.
     """
-    x, out = problem.equations.x, np.zeros(problem.points.n_vertices)
+    here, out = problem.equations.here(), np.zeros(problem.points.n_vertices)
     if "bending" in problem.terms:
         hinges = cast("Bending", problem.terms["bending"])
-        halves = np.repeat(0.5 * of_hinges(hinges, x), 2)
+        halves = np.repeat(0.5 * of_hinges(hinges, here.x, here.frozen[hinges]), 2)
         out += _density_on_vertices(problem, hinges.stencil[:, :2].ravel(), halves)
     if "midedge" in problem.terms:
         midedge = cast("MidEdge", problem.terms["midedge"])
-        thirds = np.repeat(of_triangles(midedge, x, problem.equations.step.frozen[midedge]) / 3.0, 3)
+        thirds = np.repeat(of_triangles(midedge, here.x, here.frozen[midedge]) / 3.0, 3)
         out += _density_on_vertices(problem, midedge.stencil.ravel(), thirds)
     return out
 
@@ -84,8 +84,8 @@ def _bending_density(problem: Problem, of_hinges: OnHinges, of_triangles: OnTria
 def _bending_energy(problem: Problem) -> Array:
     return _bending_density(
         problem,
-        lambda hinges, x: hinges.all_energies(x, hinges.n_elements),
-        lambda midedge, x, frames: midedge.all_energies(x, frames, midedge.n_elements),
+        lambda hinges, x, frozen: hinges.all_energies(x, frozen, hinges.n_elements),
+        lambda midedge, x, frozen: midedge.all_energies(x, frozen, midedge.n_elements),
     )
 
 
@@ -94,16 +94,19 @@ def _curvature(problem: Problem) -> Array:
     return _bending_density(
         problem,
         # NaN curvatures: the angle of a collapsed triangle is undefined
-        lambda hinges, x: -hinges.elements.data["length"] * hinges.weights(x) * hinges.angles(x),
-        lambda midedge, x, frames: (
-            midedge.areas * np.nan_to_num(midedge.curvatures(x, frames)[:, :2].sum(axis=1))
+        lambda hinges, x, frozen: (
+            -hinges.elements.data["length"] * hinges.weights(x) * hinges.angles(x, frozen)
+        ),
+        lambda midedge, x, frozen: (
+            midedge.areas * np.nan_to_num(midedge.curvatures(x, frozen)[:, :2].sum(axis=1))
         ),
     )
 
 
 def _curvature_tensor(problem: Problem) -> Array:
     midedge = cast("MidEdge", problem.terms["midedge"])
-    curvatures = midedge.curvatures(problem.equations.x, problem.equations.step.frozen[midedge])
+    here = problem.equations.here()
+    curvatures = midedge.curvatures(here.x, here.frozen[midedge])
     out = np.zeros((problem.membrane.n_owned, 3))  # stays zero for triangles without bending stiffness
     numbers = problem.membrane.elements.index[: len(out)]
     order = np.argsort(numbers)

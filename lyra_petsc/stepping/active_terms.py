@@ -12,6 +12,7 @@ from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.protocols import (
     Dissipates,
     HasDirectors,
+    HasGeometry,
     LimitsStep,
     MovingTargets,
     SharesFrozen,
@@ -56,8 +57,8 @@ class ActiveTerms:
         Terms with a state; those of which steps make heat.
     of_contact, sliding : list of Elastic
         The terms of contact, and friction alone, if there are any.
-    with_edges : list of HasDirectors
-        Terms with directors.
+    with_edges, with_geometry : list of Elastic
+        Terms with directors; those of which several methods need the same geometry.
     coarse : dict of Elastic → Elastic
         The terms that replace terms with unknowns of edges on coarse levels of multigrid.
     """
@@ -80,6 +81,7 @@ class ActiveTerms:
         self.sliding: list[Any] = [term for term in self.external if term.registration.of_contact]
         self.of_contact: list[Any] = [term for term in self.elastic if term.registration.of_contact]
         self.with_edges = [term for term in self.elastic if isinstance(term, HasDirectors)]
+        self.with_geometry = [term for term in self.elastic if isinstance(term, HasGeometry)]
         self.coarse: dict[Elastic, Elastic] = {}
 
     def freeze(self, step: UpcomingStep) -> Frozen:

@@ -85,6 +85,7 @@ class Damping:
         self._multiple: ScaledDamping | None = None
         self._x: Array | None = None
         self.frozen: Mapping[Term, Any] = {}
+        self._located: Mapping[Term, Any] = {}
         factors = np.concatenate([np.empty(0), *(t.elements.data["damping"] for t in self._terms)])
         uniform = len(factors) > 0 and factors.min() == factors.max()
         self._gamma = float(factors[0]) if uniform else 0.0
@@ -95,12 +96,15 @@ class Damping:
         """The block rows of fixed stencils; all damped terms have such stencils."""
         return self._discretisation.fixed
 
-    def freeze(self, x: Array, frozen: Mapping[Term, Any]) -> None:
-        """Set the geometry to positions x (n_local, 3), not copied, with the terms' frozen data."""
+    def freeze(self, x: Array, frozen: Mapping[Term, Any], located: Mapping[Term, Any]) -> None:
+        """Set the geometry to positions x (n_local, 3), not copied, with the terms' frozen data, and these
+        with what is known of the geometry there.
+        """
         self.release_values()
-        self._x, self._stored, self.frozen = x, False, frozen
+        self._x, self._stored, self.frozen, self._located = x, False, frozen, located
         if not self._single_assembly:
             self._stored_values()
+            self._located = frozen  # frees the memory of the geometry
 
     def release_values(self) -> None:
         """Stop using the block rows that `assemble_with_stiffness` was given."""
@@ -108,7 +112,7 @@ class Damping:
 
     def _add(self, x: Array, weight: Callable[[Elastic], Array | float], values: Array) -> None:
         for term in self._terms:
-            self._blocks.add_stiffness(term, x, self.frozen[term], 1.0, weight(term), values)
+            self._blocks.add_stiffness(term, x, self._located[term], 1.0, weight(term), values)
 
     def _stored_values(self) -> Array:
         """Values of D, assembled at the first call after a change of the geometry."""
@@ -130,9 +134,10 @@ class Damping:
 
     def product_at(self, x: Array, v: Array) -> Array:
         """D v with the geometry of positions x (n_local, 3), instead of the geometry of the step."""
-        kept, self._x, self._stored = self._x, x, False
+        kept = self._x, self._located
+        self._x, self._located, self._stored = x, self.frozen, False
         out = self._blocks.product(self._stored_values(), v)
-        self._x, self._stored = kept, False
+        (self._x, self._located), self._stored = kept, False
         return out
 
     def assemble(self, values: Array, diagonal: Array) -> None:

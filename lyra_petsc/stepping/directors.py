@@ -60,11 +60,6 @@ class Directors:
         self.frozen_in_step = frozen
         return {term: term.frames_at_end(x, frozen[term]) for term in self._terms}
 
-    def forget(self) -> None:
-        """Discard the remembered directors, whose memory the linear solve needs."""
-        for term in self._terms:
-            term.clear_cache()
-
     def largest_turn(self, displacement: Array) -> float:
         """Largest angle [rad] by which directors turn in a displacement (n_owned, 3) [m]; collective."""
         turn = max((term.largest_rotation(displacement) for term in self._terms), default=0.0)

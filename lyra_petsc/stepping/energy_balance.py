@@ -17,6 +17,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.directors import move_frames_to_end
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import kinetic_energy
+from lyra_petsc.stepping.time_step import Evaluation
 from lyra_petsc.terms.energies import ENERGIES
 from lyra_petsc.terms.protocols import Dissipates, MovingTargets, PullsHandles
 
@@ -167,20 +168,20 @@ class EnergyBalance:
 
     def measure(self) -> None:
         """Write the energies of the present state into the budget."""
-        entries, self._moving_energy, _ = self._measured()
+        entries, self._moving_energy, _ = self._measured(self._equations.here())
         self.budget = replace(self.budget, **entries)
 
-    def _measured(self, *local: float) -> tuple[dict[str, Any], float, list[float]]:
-        """Energies of the present state as entries of a `Budget`, the energy of the terms with moving
-        targets, and the sums of ``local`` over ranks.
+    def _measured(self, here: Evaluation, *local: float) -> tuple[dict[str, Any], float, list[float]]:
+        """Energies of the state, evaluated ``here``, as entries of a `Budget`, the energy of the terms with
+        moving targets, and the sums of ``local`` over ranks.
         """
         equations, moving = self._equations, 0.0
         energies = dict.fromkeys([*ENERGIES, *self._columns], 0.0)
         for term in equations.active.elastic:
             if name := term.registration.energy:
-                frozen = equations.step.frozen[term]
-                energy = float(term.energies(equations.x, frozen).sum())
-                energy -= term.heat(equations.x, frozen) if isinstance(term, Dissipates) else 0.0
+                frozen = here.frozen[term]
+                energy = float(term.energies(here.x, frozen).sum())
+                energy -= term.heat(here.x, frozen) if isinstance(term, Dissipates) else 0.0
                 energies[name] += energy
                 moving += energy if isinstance(term, MovingTargets) else 0.0
         for load in equations.active.loads:
@@ -188,7 +189,6 @@ class EnergyBalance:
                 energies[name] += load.potential(equations.x)
         energies["kinetic"] = kinetic_energy(equations.mass, equations.v[: equations.points.n_owned])
         sums = equations.points.global_sum(*energies.values(), moving, *local).tolist()
-        equations.directors.forget()  # the next step has other frames
         every = dict(zip(energies, sums, strict=False))
         more = {name: every.pop(name) for name in self._columns}
         entries = {name.removesuffix("_energy"): energy for name, energy in every.items()} | {"more": more}
@@ -221,14 +221,13 @@ class EnergyBalance:
         by_targets += _move_targets_to_end(equations)
         work = _work_of(external, x_before, equations.x) + by_targets
         del external  # to save memory
-        fabric = sum(
-            term.heat(equations.x, equations.step.frozen[term]) for term in equations.active.dissipating
-        )
+        here = equations.here()
+        fabric = sum(term.heat(here.x, here.frozen[term]) for term in equations.active.dissipating)
         impacts = equations.contact_end.impulses.heat
         inertia = kinetic_energy(equations.mass, equations.stage_velocity - equations.step.v_h)
         before, moving_before = self.budget, self._moving_energy
         local = work, damped, fabric, impacts, by_obstacles, at_start, inertia
-        energies, moving, sums = self._measured(*local)
+        energies, moving, sums = self._measured(here, *local)
         work, damped, fabric, impacts, by_obstacles, at_start, inertia = sums
         if self._ends is None:  # a handle does work on the sheet through targets that move with it
             work -= moving_before

@@ -282,7 +282,8 @@ class EndForces:
         start = self._start.get("pull")
         if start is None:
             start = equations.forces.sum(self._plain, ends[0].x, step.frozen)
-        self._end["pull"] = pull = equations.forces.sum(self._plain, ends[1].x, step.frozen)
+        here = equations.here()
+        self._end["pull"] = pull = equations.forces.sum(self._plain, here.x, here.frozen)
         targets, weight = np.zeros_like(ends[1].x), np.zeros_like(ends[1].x)
         for end in ends:
             for term in self._targets:

@@ -89,17 +89,17 @@ class StageForces:
         springs = [term for term in active.external if term not in active.sliding]
         for name, terms in (("springs", springs), ("friction", active.sliding)):
             if terms:
-                yield self._with_square(step, name, self.sum(terms, at.x, step.frozen))
+                yield self._with_square(step, name, self.sum(terms, at.x, at.frozen))
         yield self._with_square(step, "loads", -step.loads.force_at(at.x))
         if self.damps:
             yield self._with_square(step, "damping", at.damping)
         if active.viscous and not step.lagged:
-            yield self._with_square(step, "wind", self.sum(active.viscous, at.v, step.frozen))
+            yield self._with_square(step, "wind", self.sum(active.viscous, at.v, at.frozen))
         yield self._with_square(step, "internal", at.internal)
 
     def internal(self, at: Evaluation) -> Array:
         """Forces (n_owned, 3) [N] of the sheet."""
-        return self.sum(self.active.sheet, at.x, at.step.frozen)
+        return self.sum(self.active.sheet, at.x, at.frozen)
 
     def damping(self, at: Evaluation) -> Array:
         """Forces (n_owned, 3) [N] of material damping."""
@@ -145,7 +145,7 @@ class StageForces:
         energy at which strains are of order one: small strains are small differences of large coordinates.
         """
         step, n = at.step, len(self.mass)
-        rate, v, frozen = 1.0 / step.stage.c, at.v[:n], step.frozen
+        rate, v, frozen = 1.0 / step.stage.c, at.v[:n], at.frozen
         parts, square = [step.stage.sigma * kinetic_energy(self.mass, v - step.v_h)], 0.0
         for term in self.active.elastic:
             if not term.n_elements:
@@ -202,10 +202,10 @@ class StageForces:
         if not (whole and self._damping.assemble_with_stiffness(reach, inertia, values, changing)):
             self._damping.assemble(values, inertia)
             for term in self.active.elastic:
-                rows.add_stiffness(term, at.x, step.frozen[term], convexity, reach, values, predicted)
+                rows.add_stiffness(term, at.x, at.frozen[term], convexity, reach, values, predicted)
         if not step.lagged:
             for wind in self.active.viscous:
-                wind.add_hessian(at.v, step.frozen[wind], rows.pattern.offsets, values)
+                wind.add_hessian(at.v, at.frozen[wind], rows.pattern.offsets, values)
         if step.loads.following is not None and convexity < 1.0:
             step.loads.following.add_hessian((1.0 - convexity) * reach, rows.pattern, values)
         force = self._force_of_prescribed(step.prescribed, values) if step.linear else None

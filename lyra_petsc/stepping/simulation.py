@@ -161,7 +161,7 @@ class SteppedScene:
         for term in equations.active.stateful:
             if isinstance(term, Dissipates):  # whose rest state has edges in equilibrium
                 term.initialise(equations.x)
-        start = equations.at(equations.x, equations.v)
+        start = equations.here()
         self.notes.extend(nothing_acts(scene, start, event_times(scene), self.control.end, floor))
         self.equilibrium: Equilibrium | None = None
         if scene.time.static:

@@ -14,7 +14,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
-from lyra_petsc.stepping.active_terms import ActiveTerms
+from lyra_petsc.stepping.active_terms import ActiveTerms, Frozen
 from lyra_petsc.stepping.applied_loads import LoadCase, StepLoads
 from lyra_petsc.stepping.damping import Damping
 from lyra_petsc.stepping.directors import Directors
@@ -27,6 +27,7 @@ from lyra_petsc.stepping.start_acceleration import StartAcceleration
 from lyra_petsc.stepping.state import State
 from lyra_petsc.stepping.time_step import Evaluation, TimeStep
 from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
+from lyra_petsc.terms.protocols import Located
 from lyra_petsc.terms.step_end import ContactEnd, StepEnd
 from lyra_petsc.terms.term import Term, UpcomingStep
 
@@ -154,8 +155,7 @@ class StageEquations:
         """End the step just accepted with other frozen data of some terms."""
         self.refreeze(changed)
         self.evaluated = self.at(self.evaluated.x, self.evaluated.v)
-        if self.state.evaluation is not None:
-            self.state.evaluation = self.evaluated
+        self.state.evaluation = self.evaluated if self._starts_next(self.step) else None
 
     def hold_targets(self, time: float) -> None:
         """Put moving targets at their positions at ``time`` [s], between two steps; collective."""
@@ -199,8 +199,7 @@ class StageEquations:
         x, lagged, step = self.frozen_positions(at), self.integrator.lagged_loads, self.step
         frozen = self.active.freeze(self.targets_at(at, x))
         self.directors.begin_step()
-        known, terms = self.state.evaluation, self.active.with_edges
-        if known and any(frozen[term].number != known.step.frozen[term].number for term in terms):
+        if self._known_geometry(frozen) is None:
             self.state.evaluation = None  # its forces are those with other frames
         viscous = self.active.viscous if lagged else []
         wind = self.forces.sum(viscous, self.v, frozen) if viscous else None
@@ -213,7 +212,8 @@ class StageEquations:
             lagged=lagged,
         )
         if self.damping.active:
-            self.damping.freeze(x, frozen)
+            geometry = None if self.integrator.centred else self.state.geometry
+            self.damping.freeze(x, frozen, self.active.refreeze(frozen, geometry or {}))
 
     def _set_stage(self, at: float) -> None:
         """Set the stage at the time ``at`` [s], its histories, and the velocities of prescribed unknowns."""
@@ -254,9 +254,11 @@ class StageEquations:
         if self.integrator.handles_at_stage:
             held.overwrite(rate, self.prescriptions.end_rates(step))
         self.state.set(moved, rate)
-        if step.linear and not self.active.moving:
-            # the stage is at the end, and the next step is linearised there
+        if self._starts_next(step):
             self.evaluated = self.state.evaluation = self.at(self.x, solution.v)
+        elif step.ends_at_stage and step.stage.x is None and not solution.v[held.mask].any():
+            # the state is at the stage, as no handle moves
+            self.state.evaluation = self.at(self.x, solution.v, solution.geometry)
         if self.integrator.dynamic:
             self.nears_limit = self.active.limits_act(self.x, step.frozen, self.points)
         if not self.integrator.dynamic or self.contact is None:
@@ -267,8 +269,12 @@ class StageEquations:
         self.contact_end = self.contact.finish(self._finished(), step.frozen, self.contact_before)
         if self.near:
             change = self.contact_end.impulses.change
-            self.state.set(self.x[:n], self.v[:n] + change)
+            self.state.set_velocity(self.v[:n] + change)
             self.integrators.in_contact.shift_past_velocities(change)
+
+    def _starts_next(self, step: TimeStep) -> bool:
+        """Whether the stage of a step is at its end, and the next step is linearised there."""
+        return step.linear and not self.active.moving
 
     def output_velocity(self) -> Array:
         """Velocities (n_owned, 3) [m/s] for output: those of prescribed unknowns are ẋ*(t)."""
@@ -279,14 +285,39 @@ class StageEquations:
 
     # -- evaluations -------------------------------------------------------------------------------
 
-    def at(self, x: Array, v: Array, known: Array | None = None) -> Evaluation:
-        """An evaluation of the present step at positions and velocities x, v (n_local, 3)."""
-        return Evaluation(self.step, x, v, self.forces, known)
+    def at(self, x: Array, v: Array, geometry: Mapping[Any, Located] | None = None) -> Evaluation:
+        """An evaluation of the present step at positions and velocities x, v (n_local, 3), with the terms'
+        geometry there where it is known.
+        """
+        return Evaluation(self.step, x, v, self.forces, known_geometry=geometry)
+
+    def here(self) -> Evaluation:
+        """The state as a point of the present step, kept for the start of the next."""
+        known = self.state.evaluation
+        if known is None or known.step.number != self.step.number:
+            known = self.at(self.x, self.v, self._known_geometry(self.step.frozen))
+            self.state.evaluation = known
+        return known
+
+    @property
+    def _known_start(self) -> Evaluation | None:
+        """The end of the last step, where this one starts, if it is known."""
+        known = self.state.evaluation
+        return known if known is not None and known.step.end == self.step.start else None
+
+    def _known_geometry(self, frozen: Frozen) -> Mapping[Any, Located] | None:
+        """The terms' geometry at the positions of the state, if it is known for these frozen data."""
+        known, terms = self.state.evaluation, self.active.with_edges
+        if known is None or any(frozen[term].number != known.step.frozen[term].number for term in terms):
+            return None
+        return known.geometry
 
     def evaluate(self, v: Array) -> Evaluation:
         """The stage at velocities v (n_owned, 3); collective."""
-        rates = self.points.extended(v)
-        return self.revisit(self.at(self.step.stage.c * rates + self.step.x_h, rates))
+        step, rates, geometry = self.step, self.points.extended(v), None
+        if step.stage.x is None and not rates.any():  # where the step starts
+            geometry = self._known_geometry(step.frozen) if self._known_start else None
+        return self.revisit(self.at(step.stage.c * rates + step.x_h, rates, geometry))
 
     def linearised(self, v: Array) -> Evaluation:
         """The stage at which F and its Jacobian are evaluated for velocities v (n_owned, 3); collective.
@@ -296,9 +327,11 @@ class StageEquations:
         """
         if not self.step.linear:
             return self.evaluate(v)
-        x_h, known = self.step.x_h, self.state.evaluation
+        x_h, known = self.step.x_h, self._known_start
+        geometry = self._known_geometry(self.step.frozen) if known else None
+        forces = known.internal if known and self._starts_next(known.step) else None
         self.state.evaluation = None
-        return self.revisit(self.at(x_h, np.zeros_like(x_h), known.internal if known else None))
+        return self.revisit(Evaluation(self.step, x_h, np.zeros_like(x_h), self.forces, forces, geometry))
 
     def revisit(self, evaluation: Evaluation) -> Evaluation:
         """An evaluation of the present step again, with the pairs that are near there; collective."""

@@ -279,7 +279,9 @@ class StageSolver:
         if any(equations.points.global_max(not np.isfinite(velocity).all())):
             return None, "the velocities are not finite"
         whole = self._iterates or step.of_edges
-        return self._points.at(reached) if whole else equations.evaluate(velocity), ""
+        evaluation = self._points.at(reached) if whole else equations.evaluate(velocity)
+        self._points.forget()  # to save memory
+        return evaluation, ""
 
     def _message(self, error: Exception) -> str:
         """Message of a solve that PETSc stopped on all ranks, if another preset may help; collective."""
@@ -356,7 +358,8 @@ class StageSolver:
         if self._known_guess is not None:
             guess[:] = self._known_guess
             return
-        if first_guess(equations, self._start, guess):
+        first = first_guess(equations, self._start, guess)
+        if first.extrapolated:
             self.newton.curve_guess(equations.stationary_velocity(), self._start, guess)
         if not self._iterates:
             # the linear solve starts from the extrapolation; its tolerance stays relative to the full step
@@ -364,6 +367,9 @@ class StageSolver:
             ahead = self._extrapolation.extrapolate(step.end, step.start, v)
             equations.prescribe(ahead)
             snes.getSolutionUpdate().setArray((guess - ahead).ravel())
+        elif first.point is not None:
+            del guess  # the vector's state changes when its array is no longer used
+            self._points.add(u, first.point)
 
     def _ijacobian(
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from lyra_petsc.stepping.integrators.integrator import NeedsAcceleration
 from lyra_petsc.stepping.prescribed import Prescriptions
 from lyra_petsc.stepping.state import State
 from lyra_petsc.stepping.time_step import Evaluation, TimeStep
+from lyra_petsc.terms.protocols import Located
 from lyra_petsc.terms.step_end import INSTANT
 
 if TYPE_CHECKING:
@@ -98,20 +100,22 @@ class StartAcceleration:
             at_start = step.changed(frozen=active.with_targets(step.frozen, there))
         else:
             at_start = step
+        geometry = state.geometry or Evaluation(at_start, state.x, v, forces).geometry
         if forces.damps and layout.n_edges_global:
-            self._balance_moments(at_start, v)
-        force = self._out_of_balance(at_start, v)
+            self._balance_moments(at_start, v, geometry)
+        force = self._out_of_balance(at_start, v, geometry)
         acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
         start = step.finished(layout, forces.mass, state.x, v, self._integrators.present.order)
         for term in active.sliding if self._contact is not None and self._contact.near else ():
             acceleration = term.hold(start, acceleration, step.frozen[term])
         return acceleration
 
-    def _out_of_balance(self, step: TimeStep, v: Array) -> Array:
+    def _out_of_balance(self, step: TimeStep, v: Array, geometry: Mapping[Any, Located]) -> Array:
         """Force (n_owned, 3) [N] on the free unknowns at the state's positions with velocities v."""
-        return self._forces.out_of_balance(Evaluation(step, self._state.x, v, self._forces))
+        at = Evaluation(step, self._state.x, v, self._forces, known_geometry=geometry)
+        return self._forces.out_of_balance(at)
 
-    def _balance_moments(self, step: TimeStep, v: Array) -> None:
+    def _balance_moments(self, step: TimeStep, v: Array, geometry: Mapping[Any, Located]) -> None:
         """Set the rates of free directors, in v (n_local, 3) and in the state; collective.
 
         Directors have no mass: damping balances their moments. Other rates would give the vertices the
@@ -125,7 +129,7 @@ class StartAcceleration:
                 damping = term.elements.data["damping"]
                 diagonal.reshape(-1)[term.edge_indices] += term.edge_stiffness(damping)
         scale = np.divide(1.0, diagonal[edges], out=np.zeros_like(v[edges]), where=diagonal[edges] > 0.0)
-        residual = self._out_of_balance(step, v)[edges]
+        residual = self._out_of_balance(step, v, geometry)[edges]
         direction = scale * residual
         square = first = layout.global_sum(float(np.vdot(residual, direction)))[0]
         for _ in range(MAX_ITERATIONS):

@@ -52,7 +52,7 @@ def nothing_acts(
         for load in active.loads:
             load.add_force(start.x, t0, t1, force := np.zeros_like(start.x))
             acting += float(np.abs(force).max(initial=0.0))
-    gradient = start.forces.sum(active.elastic, start.x, start.step.frozen)
+    gradient = start.forces.sum(active.elastic, start.x, start.frozen)
     acting, square = comm.allreduce(np.array([acting, float(np.vdot(gradient, gradient))]))
     if acting > 0.0 or square > floor**2:
         return []

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from lyra_petsc.linear.discretisation import Discretisation
 if TYPE_CHECKING:
     from lyra_petsc.stepping.prescribed import PrescribedUnknowns
     from lyra_petsc.stepping.time_step import Evaluation
+    from lyra_petsc.terms.protocols import Located
 
 
 class State:
@@ -22,11 +24,16 @@ class State:
     x, v : (n_local, 3)
         Positions [m] and velocities [m/s]; rows of edges hold their unknowns and the rates of these.
     evaluation : Evaluation or None
-        The stage of the last step, if it is at these positions.
+        A point of the last step at these positions, if one is known.
     """
 
     _past_velocity: Array | None = None
     evaluation: Evaluation | None = None
+
+    @property
+    def geometry(self) -> Mapping[Any, Located] | None:
+        """The terms' geometry at these positions, if it is known."""
+        return None if self.evaluation is None else self.evaluation.geometry
 
     def __init__(self, discretisation: Discretisation) -> None:
         self._discretisation = discretisation
@@ -34,7 +41,8 @@ class State:
         self.x, self.v = np.zeros((n_local, 3)), np.zeros((n_local, 3))
 
     def update_ghosts(self) -> None:
-        """Copy the owners' values to the ghost rows; collective."""
+        """Copy the owners' values to the ghost rows, after the values have changed; collective."""
+        self.evaluation = None
         layout = self._discretisation.layout
         for values in (self.x, self.v):
             layout.update_ghosts(values)
@@ -78,6 +86,10 @@ class State:
         layout.update_ghosts(displacement)
         return displacement
 
+    def forget(self) -> None:
+        """Free what is known at these positions, which the step has left."""
+        self.evaluation = None
+
     def keep_past(self, velocity: Array) -> None:
         """Keep the velocities (n_owned, 3) [m/s] before the last step, for `expected_displacement`."""
         self._past_velocity = velocity
@@ -86,6 +98,10 @@ class State:
         """Set positions and velocities (n_owned, 3), in new arrays; collective."""
         extended, self.evaluation = self._discretisation.layout.extended, None
         self.x, self.v = extended(x), extended(v)
+
+    def set_velocity(self, v: Array) -> None:
+        """Set velocities (n_owned, 3), in a new array, at the same positions; collective."""
+        self.v = self._discretisation.layout.extended(v)
 
 
 def kinetic_energy(mass: Array, velocity: Array) -> float:

@@ -14,6 +14,7 @@ from lyra_petsc.stepping.applied_loads import StepLoads
 from lyra_petsc.stepping.integrators.integrator import Stage
 from lyra_petsc.stepping.prescribed import PrescribedUnknowns
 from lyra_petsc.stepping.reference_positions import ReferencePositions
+from lyra_petsc.terms.protocols import Located
 from lyra_petsc.terms.step_end import StepEnd
 from lyra_petsc.terms.term import Term, UpcomingStep
 
@@ -119,6 +120,8 @@ class Evaluation:
         The equations.
     known : (n_owned, 3) or None
         The internal forces, where an earlier evaluation has had them.
+    known_geometry : mapping of Term or None
+        The `geometry` of an earlier evaluation at the same positions.
     """
 
     step: TimeStep
@@ -126,6 +129,20 @@ class Evaluation:
     v: Array
     forces: StageForces
     known: Array | None = None
+    known_geometry: Mapping[Any, Located] | None = None
+
+    @cached_property
+    def geometry(self) -> Mapping[Any, Located]:
+        """Frozen data of the terms that have geometry, with it."""
+        if self.known_geometry is not None:
+            return self.known_geometry
+        frozen = self.step.frozen
+        return {term: term.at(self.x, frozen[term]) for term in self.forces.active.with_geometry}
+
+    @cached_property
+    def frozen(self) -> Mapping[Term, Any]:
+        """Data of each term that are constant in the step, with its geometry here."""
+        return self.forces.active.refreeze(self.step.frozen, self.geometry)
 
     @cached_property
     def internal(self) -> Array:

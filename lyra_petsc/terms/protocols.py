@@ -6,11 +6,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import Any, NamedTuple
 
-from lyra_petsc.arrays import Array, Ints, Mask
+import numpy as np
+
+from lyra_petsc.arrays import Array, Ints, Mask, unwritable
 from lyra_petsc.terms.term import Elastic
 
 LARGEST_ROTATION = 1.0
@@ -46,6 +50,47 @@ class TermState(NamedTuple):
     place: Place
     values: Array
     vertices: Ints | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Frozen data of a term together with what follows from them and positions.
+
+    Attributes
+    ----------
+    frozen : any
+        As ``freeze`` returns them.
+    compute : callable
+        Returns the geometry at the positions.
+    """
+
+    frozen: Any
+    compute: Callable[[], Any]
+
+    @cached_property
+    def geometry(self) -> Any:
+        """The geometry, of read-only arrays, computed when it is first needed."""
+        geometry = self.compute()
+        unwritable(*((geometry,) if isinstance(geometry, np.ndarray) else geometry))
+        return geometry
+
+
+class HasGeometry(Elastic):
+    """An energy of which energies, gradient and Hessian need the same geometry.
+
+    Methods that take positions and ``frozen`` data also take, in place of these, what `at` returns for the
+    same positions.
+    """
+
+    @abstractmethod
+    def compute_geometry(self, x: Array, frozen: Any) -> Any:
+        """An array, or several, that follow from positions x (n_local, 3) and the frozen data."""
+
+    def at(self, x: Array, frozen: Any) -> Located:
+        """The frozen data with the geometry at positions x (n_local, 3); unchanged if they have it."""
+        if isinstance(frozen, Located):
+            return frozen
+        return Located(frozen, lambda: self.compute_geometry(x, frozen))
 
 
 class Stateful(Elastic):
@@ -134,7 +179,7 @@ class PullsHandles(FollowsHandles):
 
 
 class SharesFrozen(Elastic):
-    """An energy whose ``frozen`` data are those of another term, its ``partner``."""
+    """An energy whose ``frozen`` data, with their geometry, are those of another term, its ``partner``."""
 
     partner: Elastic
 
@@ -176,7 +221,3 @@ class HasDirectors(Stateful):
     @abstractmethod
     def frames_at_end(self, x: Array, frozen: Any) -> Any:
         """Frozen frames for positions x at the end of a step; ``accept`` then takes them unchanged."""
-
-    @abstractmethod
-    def clear_cache(self) -> None:
-        """Free everything that can be computed again from positions."""

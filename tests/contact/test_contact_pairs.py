@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import unwritable
 from lyra_petsc.contact import contact_pairs, pair_distances, pair_motion, surface_shares
 from lyra_petsc.contact.pair_distances import (
     EDGE_EDGE,
@@ -18,7 +19,6 @@ from lyra_petsc.contact.pair_distances import (
     VERTEX_TRIANGLE,
 )
 from lyra_petsc.contact.pair_motion import CCD_TOLERANCE
-from lyra_petsc.terms.position_cache import unwritable
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

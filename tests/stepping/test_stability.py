@@ -123,6 +123,7 @@ def test_the_hessian_is_the_derivative_of_all_forces(name: str) -> None:
     equations = simulation.problem.equations
     equations.take_loads(factor=0.7, unbalanced=None)
     equations.x[:, 0] *= 0.95
+    equations.state.forget()
     equations.begin_step(0.3, 0.7)
     free = np.flatnonzero(equations.step.prescribed.free)
     add_exact_hessian(equations, values := equations.discretisation.rows.zeros())
@@ -140,12 +141,14 @@ def test_the_hessian_is_the_derivative_of_all_forces(name: str) -> None:
         for sign in (1.0, -1.0):
             equations.x.ravel()[:] = here.ravel()
             equations.x.ravel()[place] += sign * 1e-6
+            equations.state.forget()
             equations.begin_step(0.3, 0.7)
             force.append(equations.out_of_balance().ravel()[free])
         slopes[:, column] = (force[1] - force[0]) / 2e-6
     symmetric = 0.5 * (slopes + slopes.T)
     np.testing.assert_allclose(dense, symmetric, rtol=0, atol=1e-6 * np.abs(slopes).max())
     equations.x[:] = here
+    equations.state.forget()
     equations.begin_step(0.3, 0.7)
     values = np.linalg.eigvalsh(symmetric)
     with Examination(equations, 1.4) as examination:

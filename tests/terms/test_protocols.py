@@ -31,6 +31,7 @@ from lyra_petsc.terms.bending.midedge import edge_numbers
 from lyra_petsc.terms.protocols import (
     Dissipates,
     HasDirectors,
+    HasGeometry,
     LimitsStep,
     MovingTargets,
     Place,
@@ -78,6 +79,25 @@ def bent(x: Array, size: float = 0.02, seed: int = 5) -> Array:
 def test_the_interface_of_an_ordinary_term_is_small() -> None:
     public = {name for kind in Elastic.__mro__[:-1] for name in vars(kind) if not name.startswith("_")}
     assert len(public) <= MAX_MEMBERS, sorted(public)
+
+
+@having(HasGeometry)
+def test_data_that_hold_the_geometry_give_the_same_and_compute_it_once(name: str, tmp_path: Path) -> None:
+    with example(name, tmp_path) as simulation:
+        term, x = simulation.problem.terms[name], bent(simulation.equations.x)
+        assert isinstance(term, HasGeometry)
+        frozen = frozen_by(term, simulation.equations)
+        here = term.at(x, frozen)
+        assert here.frozen is frozen
+        assert term.at(x, here) is here
+        np.testing.assert_array_equal(term.energies(x, here), term.energies(x, frozen))
+        np.testing.assert_array_equal(gradient(term, x, here), gradient(term, x, frozen))
+        geometry = here.geometry
+        assert here.geometry is geometry
+        arrays = [geometry] if isinstance(geometry, np.ndarray) else geometry
+        assert not any(values.flags.writeable for values in arrays)
+        there = term.at(bent(x, 0.01, 6), frozen)
+        assert not np.array_equal(term.energies(x, there), term.energies(x, here))
 
 
 @having(Stateful)

@@ -53,7 +53,7 @@ def limit_roundoff(at: Evaluation) -> float:
     for term in at.forces.active.elastic:
         if isinstance(term, LimitsStep):
             amount = np.repeat(
-                term.stiffness(x, at.step.frozen[term]) * term.coordinate_scale(size), term.stencil.shape[1]
+                term.stiffness(x, at.frozen[term]) * term.coordinate_scale(size), term.stencil.shape[1]
             )
             scale += np.bincount(term.stencil.ravel(), amount, layout.n_local)
     return _norm(layout, scale[: layout.n_owned])

@@ -8,33 +8,49 @@ each other.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.time_step import Evaluation
 
 
-def first_guess(equations: StageEquations, start: Array, out: Array) -> bool:
+class FirstGuess(NamedTuple):
+    """How the first guess was found.
+
+    Attributes
+    ----------
+    extrapolated : bool
+        Whether it is extrapolated from earlier equilibria.
+    point : Evaluation or None
+        The stage there, if it was evaluated.
+    """
+
+    extrapolated: bool = False
+    point: Evaluation | None = None
+
+
+def first_guess(equations: StageEquations, start: Array, out: Array) -> FirstGuess:
     """Write velocities of the stage to ``out`` (n_owned, 3), prescribed unknowns exactly; collective.
 
     ``start`` (n_owned, 3) can be reached from the positions at the start of the step without a collision.
-
-    Returns whether they are extrapolated from earlier equilibria.
     """
     n, integrator = equations.points.n_owned, equations.integrator
     if integrator.starts_at_rest:
         out[:] = start
         if not isinstance(integrator, Static) or integrator.predicted is None:
-            return False
+            return FirstGuess()
         guess = integrator.predicted / integrator.pseudo_dt
         equations.prescribe(guess)
         if equations.near or not limits.moves_freely(equations, out, guess - out):
-            return False
+            return FirstGuess()
         out[:] = guess
         equations.predicted_stress.take_state(equations.x)
-        return True
+        return FirstGuess(extrapolated=True)
     moving = equations.v[:n].copy()
     equations.prescribe(moving)
     still = start
@@ -43,11 +59,11 @@ def first_guess(equations: StageEquations, start: Array, out: Array) -> bool:
         moving = moving if fraction == 1.0 else still + fraction * (moving - still)
     if integrator.order > 1 and equations.acting_contact is None and not equations.active.limiting:
         out[:] = moving
-        return False
-    energies = [equations.evaluate(v).objective[0] for v in (still, moving)]
-    use_still = energies[0] < energies[1]
+        return FirstGuess()
+    points = [equations.evaluate(v) for v in (still, moving)]
+    use_still = points[0].objective[0] < points[1].objective[0]
     out[:] = still if use_still else moving
-    return False
+    return FirstGuess(point=points[0 if use_still else 1])
 
 
 def has_start(equations: StageEquations, start: Array) -> bool:

@@ -38,14 +38,15 @@ class Iterates:
         if evaluation is not None:
             return self._equations.revisit(evaluation)
         evaluation = self._equations.linearised(u.getArray(readonly=True).reshape(-1, 3))
-        self._add(u, evaluation)
+        self.add(u, evaluation)
         return evaluation
 
     def reach(self, u: PETSc.Vec) -> None:
         """The SNES has copied the point of its last residual to its iterate u."""
         if self._known and self._key(u) not in self._known:
-            self._add(u, self._known[next(reversed(self._known))])
+            self.add(u, self._known[next(reversed(self._known))])
 
-    def _add(self, u: PETSc.Vec, evaluation: Evaluation) -> None:
+    def add(self, u: PETSc.Vec, evaluation: Evaluation) -> None:
+        """Take the evaluation at velocities u."""
         last = dict([*self._known.items()][-1:])
         self._known = last | {self._key(u): evaluation}

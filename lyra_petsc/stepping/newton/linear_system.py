@@ -300,7 +300,7 @@ class LinearSystem:
         force = self.assemble_operator(at, convexity)
         if self.preconditioner is not self.operator and not self.reuse.begin_solve(self._equations):
             self._set_preconditioner(at, keep=keep, convex=convex)
-        self._equations.directors.forget()
+        self._equations.state.forget()  # the linear solve needs the memory
         return force
 
     def _set_preconditioner(self, at: Evaluation, *, keep: bool, convex: bool) -> None:

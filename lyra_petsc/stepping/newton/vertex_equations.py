@@ -78,9 +78,9 @@ class VertexEquations:
             weight: Array | float = stage.c
             if self._forces.damps and term.registration.damped:
                 weight = weight + term.elements.data["damping"]
-            rows.add_stiffness(term, x, step.frozen.get(term), 1.0, weight, values)
+            rows.add_stiffness(term, x, at.frozen.get(term), 1.0, weight, values)
         for wind in self._viscous:
-            wind.add_hessian(at.v, step.frozen[wind], self.pattern.offsets, values)
+            wind.add_hessian(at.v, at.frozen[wind], self.pattern.offsets, values)
         if held.any():
             self._add_clamps(x, stage.c, values)
             rows.constrain(values, held, self._constrained)

@@ -263,7 +263,7 @@ class Equilibrium:
 
     def _potential_energy(self, start: Array) -> float:
         """Energy [J] without friction, less the work of loads from ``start`` (n_owned, 3); collective."""
-        equations, frozen = self._equations, self._equations.step.frozen
+        equations, frozen = self._equations, self._equations.here().frozen
         terms = [term for term in equations.active.elastic if term not in equations.active.sliding]
         energy = sum(float(term.energies(equations.x, frozen[term]).sum()) for term in terms)
         energy -= float(np.vdot(equations.step.loads.force, equations.x[: len(start)] - start))
@@ -340,8 +340,7 @@ class Equilibrium:
         if progress.solved_once and not self.lands:
             self._in_vain += progress.solves - progress.last_by_force
         stuck = attempt.failed_solve or _failed_solve(equations, progress)
-        equations.x[: len(x)] = x
-        equations.points.update_ghosts(equations.x)
+        equations.state.set(x, equations.v[: len(x)])
         transport_frames(equations, frozen)
         equations.active.restore_contacts(self._friction.contacts)
         message = f"{message}; {slides}" if slides else attempt.message or message

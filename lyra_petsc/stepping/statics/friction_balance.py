@@ -147,7 +147,7 @@ class FrictionBalance:
             self.lands = limited and increment > self._longest and landed > MAX_LANDED * force
 
     def _elastic_energy(self) -> float:
-        equations, frozen = self._equations, self._equations.step.frozen
+        equations, frozen = self._equations, self._equations.here().frozen
         terms = [term for term in equations.active.elastic if term not in equations.active.sliding]
         energy = sum(float(term.energies(equations.x, frozen[term]).sum()) for term in terms)
         return float(equations.points.global_sum(energy)[0])

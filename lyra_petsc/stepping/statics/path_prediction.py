@@ -81,13 +81,12 @@ class PathPrediction:
         (largest,) = equations.points.global_max(float(np.abs(moved).max(initial=0.0)))
         rate = self._load_rate
         if largest > 0.0:
-            x, part = equations.x.copy(), HANDLE_STEP * self._spacing / largest
+            x, v, part = equations.x[:n], equations.v[:n], HANDLE_STEP * self._spacing / largest
             here = equations.out_of_balance()
-            equations.x[:n] += part * moved
-            equations.points.update_ghosts(equations.x)
+            equations.state.set(x + part * moved, v)
             equations.change()
             rate = rate + (equations.out_of_balance() - here) / (part * step)
-            equations.x[:] = x
+            equations.state.set(x, v)
             equations.change()
         if self._whole_stiffness is None:
             self._tangent, iterations = self._response(rate)

@@ -79,9 +79,9 @@ def add_exact_hessian(equations: StageEquations, values: Array) -> FollowingLoad
     The symmetric part of the stiffness of loads that follow the shape, which are returned, is added, too.
     Prescribed unknowns are not decoupled.
     """
-    rows, active = equations.discretisation.rows, equations.active
+    rows, active, here = equations.discretisation.rows, equations.active, equations.here()
     for term in active.elastic:
-        rows.add_stiffness(term, equations.x, equations.step.frozen[term], 0.0, 1.0, values)
+        rows.add_stiffness(term, here.x, here.frozen[term], 0.0, 1.0, values)
 
     def force_of(term: Load | Viscous, x: Array, out: Array) -> None:
         """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""

@@ -23,9 +23,9 @@ from lyra_petsc.terms.bending import hinge_fading, hinge_forces, hinge_shape
 from lyra_petsc.terms.bending.hinge_energy import fading_limit
 from lyra_petsc.terms.bending.hinge_rows import add_across, add_within
 from lyra_petsc.terms.bending.hinge_triangles import triangles_of
-from lyra_petsc.terms.position_cache import PositionCache
+from lyra_petsc.terms.protocols import HasGeometry, Located
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Assembly, Couplings, Elastic, OffDiagonal
+from lyra_petsc.terms.term import Assembly, Couplings, OffDiagonal
 
 Stencil = NDArray[np.int32] | NDArray[np.int64]
 
@@ -62,7 +62,7 @@ def dihedral_angles(x: Array, stencil: Stencil) -> Array:
     return np.arctan2(sine, cosine, out=sine)
 
 
-class Bending(Elastic):
+class Bending(HasGeometry):
     """The bending energy of all hinges.
 
     Parameters
@@ -82,10 +82,8 @@ class Bending(Elastic):
         # all hinges of a triangle have the same limit for it
         self._limit = np.empty(len(self._triangles.corners))
         self._limit[self._triangles.sides[:-1] >> 2] = data["limit"]
-        # energy, gradient and Hessian are usually computed at the same positions
-        self._geometry = PositionCache(self._compute_geometry)
 
-    def _compute_geometry(self, x: Array) -> HingeGeometry:
+    def compute_geometry(self, x: Array, frozen: None) -> HingeGeometry:
         corners, sides, _ = self._triangles
         triangles = np.empty((len(corners), 7))
         sine, cosine, length = (np.empty(self.n_elements) for _ in range(3))
@@ -98,9 +96,13 @@ class Bending(Elastic):
             angles[fading] = dihedral_angles(x, self.stencil[fading])
         return HingeGeometry(triangles, angles, length, fading)
 
-    def angles(self, x: Array) -> Array:
+    def _geometry(self, x: Array, frozen: Located | None) -> HingeGeometry:
+        geometry: HingeGeometry = self.at(x, frozen).geometry
+        return geometry
+
+    def angles(self, x: Array, frozen: Located | None = None) -> Array:
         """Dihedral angles of all hinges of this rank [rad], (E,), a read-only array."""
-        return self._geometry(x).angles
+        return self._geometry(x, frozen).angles
 
     def weights(self, x: Array) -> Array:
         """Factor of each hinge's energy by which it fades, (E,); 1 unless a triangle has nearly collapsed."""
@@ -108,12 +110,12 @@ class Bending(Elastic):
         hinge_fading.weights(x, self.stencil, self._triangles.sides, self._limit, out)
         return out
 
-    def energies(self, x: Array, frozen: None = None) -> Array:
-        return self.all_energies(x, self.n_owned)
+    def energies(self, x: Array, frozen: Located | None = None) -> Array:
+        return self.all_energies(x, frozen, self.n_owned)
 
-    def all_energies(self, x: Array, n: int) -> Array:
+    def all_energies(self, x: Array, frozen: Located | None, n: int) -> Array:
         """Energy [J] of the first n hinges of this rank, (n,)."""
-        geometry = self._geometry(x)
+        geometry = self._geometry(x, frozen)
         out = self._k[:n] * (geometry.angles[:n] - self._rest[:n]) ** 2
         if len(geometry.fading):
             hinge_fading.energies(x, *self._fading(geometry), out)
@@ -124,9 +126,9 @@ class Bending(Elastic):
         hinges = self.stencil, self._triangles.sides, geometry.fading
         return *hinges, self._limit, geometry.angles, self._k, self._rest
 
-    def add_gradient(self, x: Array, frozen: None, out: Array) -> None:
+    def add_gradient(self, x: Array, frozen: Located | None, out: Array) -> None:
         corners, sides, hinges = self._triangles
-        geometry = self._geometry(x)
+        geometry = self._geometry(x, frozen)
         triangles, angles, lengths, fading = geometry
         forces = np.empty(self.n_elements + 1)
         hinge_forces.edge_forces(sides, triangles, angles, lengths, self._k, self._rest, forces)
@@ -138,10 +140,10 @@ class Bending(Elastic):
     def couplings(self) -> Couplings:
         return {self.name: self._triangles.corners, f"{self.name} across": OffDiagonal(self.stencil[:, 2:])}
 
-    def add_hessian(self, x: Array, frozen: None, into: Assembly) -> None:
+    def add_hessian(self, x: Array, frozen: Located | None, into: Assembly) -> None:
         corners, sides, hinges = self._triangles
         within, across = into.offsets[self.name], into.offsets[f"{self.name} across"]
-        geometry, convexity = self._geometry(x), into.convexity
+        geometry, convexity = self._geometry(x, frozen), into.convexity
         triangles, angles, lengths, fading = geometry
         factors = np.empty((self.n_elements + 1, 2))
         law, values = (convexity, self._k, self._rest, into.weight), into.values
@@ -150,7 +152,6 @@ class Bending(Elastic):
         if len(fading):
             to = into.weight, within, across, values
             hinge_fading.add_hessian(x, *self._fading(geometry), convexity, *to)
-        self._geometry.forget()  # frees memory for the linear solve that follows
 
     def force_scale(self, size: float) -> Array:
         return self.elements.data["k"] * size / self.elements.data["rest_height"] ** 2

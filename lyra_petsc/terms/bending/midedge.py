@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.arrays import Array, Ints, Mask, unwritable
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
@@ -51,8 +51,14 @@ from lyra_petsc.terms.bending.midedge_shape import (
     unit,
 )
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.position_cache import PositionCache, unwritable
-from lyra_petsc.terms.protocols import LARGEST_ROTATION, HasDirectors, Place, TermState
+from lyra_petsc.terms.protocols import (
+    LARGEST_ROTATION,
+    HasDirectors,
+    HasGeometry,
+    Located,
+    Place,
+    TermState,
+)
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Assembly, Term, UpcomingStep
 
@@ -93,7 +99,7 @@ class Edges(NamedTuple):
     of_triangles: NDArray[np.int32]
 
 
-class MidEdge(HasDirectors):
+class MidEdge(HasDirectors, HasGeometry):
     """The bending energy of all triangles.
 
     Parameters
@@ -131,7 +137,6 @@ class MidEdge(HasDirectors):
         rest = data["rest"] if data["rest"].any() else NO_REST_TANGENTS
         self._rest_rotation = rest_rotation_of(data)
         self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
-        self._tangents = PositionCache(self._compute_tangents)
         self._end_frames = -1  # the number of those that `frames_at_end` returned
         self._membrane: Membrane | None = None  # if it has the same triangles
 
@@ -175,7 +180,6 @@ class MidEdge(HasDirectors):
 
     def accept(self, x: Array, frozen: Frames) -> None:
         if frozen.number != self._end_frames:
-            self.clear_cache()  # the cached tangents are those of the old frames
             frozen = self._transported(frozen, x)
         self.frames = frozen
 
@@ -304,16 +308,10 @@ class MidEdge(HasDirectors):
 
     # -- energy ------------------------------------------------------------------------------------
 
-    def angle_tangents(self, x: Array, frames: Frames) -> Array:
+    def compute_geometry(self, x: Array, frozen: Frames) -> Array:
         """Tangents T of directors' angles and |N|² of triangles, (E, 4), by `midedge_shape.tangents`."""
-        return self._tangents(x, frames)
-
-    def clear_cache(self) -> None:
-        self._tangents.forget()
-
-    def _compute_tangents(self, x: Array, frames: Frames) -> Array:
         tangent = np.empty((self.n_elements, 4))
-        director = self._directors(x, frames)
+        director = self._directors(x, frozen)
         tangents(x, self.stencil, self.of_edges.of_triangles, director, self._rest_rotation, tangent)
         return tangent
 
@@ -326,25 +324,26 @@ class MidEdge(HasDirectors):
         directors(x, self.of_edges.ends, *frames.vectors, cosine, sine, out)
         return out
 
-    def energies(self, x: Array, frozen: Frames) -> Array:
+    def energies(self, x: Array, frozen: Frames | Located) -> Array:
         return self.all_energies(x, frozen, self.n_owned)
 
-    def all_energies(self, x: Array, frozen: Frames, n: int) -> Array:
+    def all_energies(self, x: Array, frozen: Frames | Located, n: int) -> Array:
         """Energy [J] of the first n triangles of this rank, (n,)."""
         out = np.empty(n)
-        midedge_energy.energies(self.angle_tangents(x, frozen), *self._constants, out)
+        midedge_energy.energies(self.at(x, frozen).geometry, *self._constants, out)
         return out
 
-    def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
+    def add_gradient(self, x: Array, frozen: Frames | Located, out: Array) -> None:
         numbers = self.stencil, self.of_edges.of_triangles, self.edges, self.elements.data["sign"]
-        bent = frozen.direction, self.angle_tangents(x, frozen), *self._constants
+        at = self.at(x, frozen)
+        bent = at.frozen.direction, at.geometry, *self._constants
         midedge_energy.add_gradient(x, *numbers, *bent, self.of_edges.length, out)
 
-    def add_hessian(self, x: Array, frozen: Frames, into: Assembly) -> None:
-        numbers = self.of_edges.of_triangles, self.elements.data["sign"]
-        bent = frozen.direction, self.angle_tangents(x, frozen), *self._constants, self.of_edges.length
-        at = into.offsets[f"{self.name} vertices"], into.offsets[self.name], into.values
-        midedge_energy.add_hessian(x, self.stencil, into.convexity, *numbers, *bent, into.weight, *at)
+    def add_hessian(self, x: Array, frozen: Frames | Located, into: Assembly) -> None:
+        numbers, at = (self.of_edges.of_triangles, self.elements.data["sign"]), self.at(x, frozen)
+        bent = at.frozen.direction, at.geometry, *self._constants, self.of_edges.length
+        to = into.offsets[f"{self.name} vertices"], into.offsets[self.name], into.values
+        midedge_energy.add_hessian(x, self.stencil, into.convexity, *numbers, *bent, into.weight, *to)
 
     def largest_rotation(self, increment: Array) -> float:
         return float(largest_angle(increment.ravel(), self.of_edges.indices, self.of_edges.length))
@@ -353,12 +352,12 @@ class MidEdge(HasDirectors):
         stiffness = self.elements.data["stiffness"]
         return (stiffness[:, 0] + stiffness[:, 3] + stiffness[:, 5]) * size * self._largest_squared_gradient
 
-    def curvatures(self, x: Array, frozen: Frames) -> Array:
+    def curvatures(self, x: Array, frozen: Frames | Located) -> Array:
         """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, (E, 3).
 
         The curvature of the rest shape is included, the angles of its creases are not.
         """
-        tangent, rotation = self.angle_tangents(x, frozen)[:, :3].copy(), self._rest_rotation
+        tangent, rotation = self.at(x, frozen).geometry[:, :3].copy(), self._rest_rotation
         if len(rotation):
             smooth = rotation[..., 0] > np.cos(CREASED)
             tangent[smooth] += rotation[..., 1][smooth] / rotation[..., 0][smooth]

@@ -19,15 +19,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, unwritable
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending import hinge, midedge, midedge_energy
 from lyra_petsc.terms.bending.hinge import edge_in_material
 from lyra_petsc.terms.bending.midedge import NO_FRICTION, MidEdge
 from lyra_petsc.terms.bending.midedge_shape import Frames
-from lyra_petsc.terms.position_cache import PositionCache
-from lyra_petsc.terms.protocols import Dissipates, Place, SharesFrozen, TermState
+from lyra_petsc.terms.protocols import Dissipates, Located, Place, SharesFrozen, TermState
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Assembly, Term, UpcomingStep
 
@@ -71,7 +70,6 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         super().__init__(elements)
         data = elements.data
         self.bent: Array = data["rest"].copy()
-        self._sliding = PositionCache(self._compute_sliding)
 
     def connect(self, terms: Iterable[Term]) -> None:
         self.partner = sheet = next(term for term in terms if isinstance(term, MidEdge))
@@ -91,16 +89,18 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
 
     # -- energy ------------------------------------------------------------------------------------
 
-    def _compute_sliding(self, x: Array, frames: Frames) -> Sliding:
+    def _sliding(self, x: Array, frozen: Frames | Located) -> Sliding:
         half, data = np.empty(self.n_elements), self.elements.data
-        tangent = self._sheet.angle_tangents(x, frames)[self._rows]
+        tangent = self._sheet.at(x, frozen).geometry[self._rows]
         constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
         midedge_energy.energies(tangent, *constants, half)
         r_y, r = data["r_y"], np.sqrt(2.0 * np.maximum(half, 0.0))
         larger = np.maximum(r, r_y)
         offset = np.where(r > r_y, 0.5 * r_y * (larger - r_y), 0.0)
         curvature = np.where(r > r_y, -1.0 / (r_y * larger), 0.0)
-        return Sliding(r_y / larger, np.column_stack([curvature, offset]), tangent)
+        sliding = Sliding(r_y / larger, np.column_stack([curvature, offset]), tangent)
+        unwritable(*sliding)
+        return sliding
 
     def _constants(self, sliding: Sliding) -> tuple[Array, ...]:
         """Directors' tangents, K, tangents of rest, limits and friction: arguments of kernels."""
@@ -108,19 +108,21 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         stiffness = data["stiffness"] * sliding.part[:, None]
         return sliding.tangent, stiffness, self.bent, data["limit"], sliding.friction
 
-    def energies(self, x: Array, frozen: Frames) -> Array:
+    def energies(self, x: Array, frozen: Frames | Located) -> Array:
         out = np.empty(self.n_owned)
         midedge_energy.energies(*self._constants(self._sliding(x, frozen)), out)
         return out
 
-    def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
+    def add_gradient(self, x: Array, frozen: Frames | Located, out: Array) -> None:
+        at = self._sheet.at(x, frozen)
         numbers = self.stencil, self._edges, self.edges, self.elements.data["sign"]
-        constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
-        midedge_energy.add_gradient(x, *numbers, frozen.direction, *constants, out)
+        constants = *self._constants(self._sliding(x, at)), self._sheet.of_edges.length
+        midedge_energy.add_gradient(x, *numbers, at.frozen.direction, *constants, out)
 
-    def add_hessian(self, x: Array, frozen: Frames, into: Assembly) -> None:
-        constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
-        numbers = self._edges, self.elements.data["sign"], frozen.direction
+    def add_hessian(self, x: Array, frozen: Frames | Located, into: Assembly) -> None:
+        located = self._sheet.at(x, frozen)
+        constants = *self._constants(self._sliding(x, located)), self._sheet.of_edges.length
+        numbers = self._edges, self.elements.data["sign"], located.frozen.direction
         at = into.offsets[f"{self.name} vertices"], into.offsets[self.name], into.values
         law = into.convexity, *numbers, *constants
         midedge_energy.add_hessian(x, self.stencil, *law, into.weight, *at)
@@ -134,35 +136,31 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
     def initialise(self, x: Array) -> None:
         self.accept(x, self._sheet.frames)
 
-    def _bent_at(self, x: Array, frames: Frames) -> Array:
+    def _bent_at(self, x: Array, frozen: Frames | Located) -> Array:
         """The value of ``bent`` after a step that ends at x."""
-        sliding = self._sliding(x, frames)
+        sliding = self._sliding(x, frozen)
         tangent, part = sliding.tangent[:, :3], sliding.part[:, None]
         slid = tangent - part * (tangent - self.bent)
         return np.where((part < 1.0) & np.isfinite(tangent), slid, self.bent)
 
-    def _become(self, bent: Array) -> None:
-        self.bent = bent
-        self._sliding.forget()
+    def accept(self, x: Array, frozen: Frames | Located) -> None:
+        self.bent = self._bent_at(x, frozen)
 
-    def accept(self, x: Array, frozen: Frames) -> None:
-        self._become(self._bent_at(x, frozen))
-
-    def heat(self, x: Array, frozen: Frames) -> float:
-        part = self._sliding(x, frozen).part
-        if not (part < 1.0).any():
+    def heat(self, x: Array, frozen: Frames | Located) -> float:
+        at, bent = self._sheet.at(x, frozen), self.bent
+        if not (self._sliding(x, at).part < 1.0).any():
             return 0.0
-        before, bent = float(self.energies(x, frozen).sum()), self.bent
-        self._become(self._bent_at(x, frozen))
-        after = float(self.energies(x, frozen).sum())
-        self._become(bent)
+        before = float(self.energies(x, at).sum())
+        self.accept(x, at)
+        after = float(self.energies(x, at).sum())
+        self.bent = bent
         return before - after
 
     def state(self) -> dict[str, TermState]:
         return {"bent": TermState(Place.ELEMENT, self.bent)}
 
     def restore(self, values: Mapping[str, Array], x: Array) -> None:
-        self._become(values["bent"].copy())
+        self.bent = values["bent"].copy()
 
 
 def elements(rest: RestShape) -> Elements:

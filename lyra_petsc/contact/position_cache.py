@@ -8,20 +8,9 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, unwritable
 
 Result = TypeVar("Result", bound="NDArray[Any] | tuple[NDArray[Any], ...]")
-
-
-def unwritable(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """The arrays, made read-only.
-
-    Kernels are compiled separately for read-only arrays, so that arrays used in place of cached results must
-    be read-only, too.
-    """
-    for array in arrays:
-        array.flags.writeable = False
-    return arrays
 
 
 class PositionCache(Generic[Result]):
