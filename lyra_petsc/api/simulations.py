@@ -170,7 +170,7 @@ class Simulation:
     @property
     def velocities(self) -> Array:
         """Current velocities (n, 3) [m/s] of this rank's vertices, a copy."""
-        return np.array(self._running.problem.equations.output_velocity()[: len(self.vertices)])
+        return self.field("velocity")
 
     def field(self, name: str) -> Array:
         """A field of those that a scene's ``output.fields`` may name, on this rank's vertices or triangles.

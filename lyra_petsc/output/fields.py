@@ -26,7 +26,12 @@ Ints = NDArray[np.int32]
 
 
 def _velocity(problem: Problem) -> Array:
-    return problem.equations.output_velocity()[: problem.points.n_vertices]
+    """That of prescribed unknowns is ẋ*(t)."""
+    equations = problem.equations
+    velocity = equations.v[: len(equations.mass)].copy()
+    if equations.step.dt > 0.0:
+        equations.step.prescribed.overwrite(velocity, equations.prescriptions.end_rates(equations.step))
+    return velocity[: problem.points.n_vertices]
 
 
 def _displacement(problem: Problem) -> Array:

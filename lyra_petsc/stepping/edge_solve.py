@@ -55,7 +55,7 @@ class EdgeSolve:
         Before the first step they are those at these positions, after `initial_moments`.
         """
         step, n = equations.step, len(equations.mass)
-        interrupted, dt = cls(step, equations.stage_velocity), step.dt or 1.0
+        interrupted, dt = cls(step, equations.evaluated.v[: len(equations.mass)]), step.dt or 1.0
         equations.predicted_stress.forget()
         held = equations.prescriptions.with_vertices(step.prescribed, equations.x[:n])
         equations.change(

@@ -224,7 +224,9 @@ class EnergyBalance:
         here = equations.here()
         fabric = sum(term.heat(here.x, here.frozen[term]) for term in equations.active.dissipating)
         impacts = equations.contact_end.impulses.heat
-        inertia = kinetic_energy(equations.mass, equations.stage_velocity - equations.step.v_h)
+        inertia = kinetic_energy(
+            equations.mass, equations.evaluated.v[: len(equations.mass)] - equations.step.v_h
+        )
         before, moving_before = self.budget, self._moving_energy
         local = work, damped, fabric, impacts, by_obstacles, at_start, inertia
         energies, moving, sums = self._measured(here, *local)
@@ -266,7 +268,7 @@ class EnergyBalance:
                 external -= part
             elif name == "damping":
                 damping = part.take(at)
-                heat = equations.step.dt * float(np.vdot(equations.stage_velocity, part))
+                heat = equations.step.dt * float(np.vdot(equations.evaluated.v[: len(equations.mass)], part))
             del part  # to save memory before the next part is computed
         equations.step.prescribed.overwrite(external, external.take(at) + self._reactions)
         return external, damping, heat

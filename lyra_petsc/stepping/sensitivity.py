@@ -208,7 +208,7 @@ class Sensitivities:
 
     def _differentiate_step(self, before: _StepStart, *, fresh: bool) -> None:
         equations = self._equations
-        velocity, end = equations.stage_velocity.copy(), self.simulation.time
+        velocity, end = equations.evaluated.v[: len(equations.mass)].copy(), self.simulation.time
         usual, taken = equations.integrator, self.simulation.last_integrator
         semi = self._semi and taken is usual
         with self._solver(velocity, set_up=not semi, keep=not fresh) as solve:

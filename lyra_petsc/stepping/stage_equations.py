@@ -14,7 +14,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
-from lyra_petsc.stepping.active_terms import ActiveTerms, Frozen
+from lyra_petsc.stepping.active_terms import ActiveTerms
 from lyra_petsc.stepping.applied_loads import LoadCase, StepLoads
 from lyra_petsc.stepping.damping import Damping
 from lyra_petsc.stepping.directors import Directors
@@ -86,11 +86,10 @@ class StageEquations:
         self.discretisation, self.mass = discretisation, mass
         moves = contact is not None and contact.obstacles_move
         self.active = active = ActiveTerms(terms, obstacles_move=moves)
-        self.contact = contact
         limited = contact is not None or bool(active.limiting)
         self.integrators = IntegratorsInUse(integrator, limited=limited)
         discretisation.when_ghosts_change(self._follow_ghosts)
-        self.held = held
+        self.contact, self.held = contact, held
         self.prescriptions = Prescriptions(discretisation, held, terms, starts)
         self.reference = self.prescriptions.reference
         self.load_case = LoadCase()
@@ -99,8 +98,7 @@ class StageEquations:
             discretisation, active.elastic, dynamic=integrator.dynamic, single_assembly=once
         )
         self.directors = Directors(active.with_edges, self.points)
-        edges = self.directors.min_stiffness
-        self.forces = StageForces(discretisation, mass, active, self.damping, edges)
+        self.forces = StageForces(discretisation, mass, active, self.damping, self.directors.min_stiffness)
         self.state = State(discretisation)
         zero, none, frozen = self.v[: len(mass)], self.prescriptions.none, dict.fromkeys(terms)
         stage, loads = Stage(1.0, 1.0, 1.0), StepLoads(np.zeros((len(mass), 3)))
@@ -182,24 +180,21 @@ class StageEquations:
         if self.contact is not None:
             self.contact.begin(t0, t1)
             self.contact.update(self.x, self.expected_displacement(), self.expected_displacement)
-        self._freeze(at)
-        self.start_acceleration.begin_step(self.step, self.frozen_positions(at))
+        x = self.state.moved(at - t0) if self.integrator.centred else self.x
+        self._freeze(at, x)
+        self.start_acceleration.begin_step(self.step, x)
         self._set_stage(at)
 
     def expected_displacement(self, steps: int = 1) -> Array:
         """As `State.expected_displacement` in the present step; collective."""
         return self.state.expected_displacement(self.step.dt, self.step.prescribed, steps)
 
-    def frozen_positions(self, at: float) -> Array:
-        """Positions (n_local, 3) [m] whose geometry is frozen during a step with the stage at ``at`` [s]."""
-        return self.state.moved(at - self.step.start) if self.integrator.centred else self.x
-
-    def _freeze(self, at: float) -> None:
-        """Freeze geometry, targets and loads at the time ``at`` [s] of the stage."""
-        x, lagged, step = self.frozen_positions(at), self.integrator.lagged_loads, self.step
+    def _freeze(self, at: float, x: Array) -> None:
+        """Freeze geometry at positions x (n_local, 3), targets and loads at the time ``at`` [s]."""
+        lagged, step = self.integrator.lagged_loads, self.step
         frozen = self.active.freeze(self.targets_at(at, x))
         self.directors.begin_step()
-        if self._known_geometry(frozen) is None:
+        if (geometry := self.state.geometry(frozen)) is None:
             self.state.evaluation = None  # its forces are those with other frames
         viscous = self.active.viscous if lagged else []
         wind = self.forces.sum(viscous, self.v, frozen) if viscous else None
@@ -212,8 +207,8 @@ class StageEquations:
             lagged=lagged,
         )
         if self.damping.active:
-            geometry = None if self.integrator.centred else self.state.geometry
-            self.damping.freeze(x, frozen, self.active.refreeze(frozen, geometry or {}))
+            located = {} if self.integrator.centred or geometry is None else geometry
+            self.damping.freeze(x, frozen, self.active.refreeze(frozen, located))
 
     def _set_stage(self, at: float) -> None:
         """Set the stage at the time ``at`` [s], its histories, and the velocities of prescribed unknowns."""
@@ -276,13 +271,6 @@ class StageEquations:
         """Whether the stage of a step is at its end, and the next step is linearised there."""
         return step.linear and not self.active.moving
 
-    def output_velocity(self) -> Array:
-        """Velocities (n_owned, 3) [m/s] for output: those of prescribed unknowns are ẋ*(t)."""
-        velocity = self.v[: len(self.mass)].copy()
-        if self.step.dt > 0.0:
-            self.step.prescribed.overwrite(velocity, self.prescriptions.end_rates(self.step))
-        return velocity
-
     # -- evaluations -------------------------------------------------------------------------------
 
     def at(self, x: Array, v: Array, geometry: Mapping[Any, Located] | None = None) -> Evaluation:
@@ -295,28 +283,14 @@ class StageEquations:
         """The state as a point of the present step, kept for the start of the next."""
         known = self.state.evaluation
         if known is None or known.step.number != self.step.number:
-            known = self.at(self.x, self.v, self._known_geometry(self.step.frozen))
-            self.state.evaluation = known
+            known = self.state.evaluation = self.at(self.x, self.v, self.state.geometry(self.step.frozen))
         return known
-
-    @property
-    def _known_start(self) -> Evaluation | None:
-        """The end of the last step, where this one starts, if it is known."""
-        known = self.state.evaluation
-        return known if known is not None and known.step.end == self.step.start else None
-
-    def _known_geometry(self, frozen: Frozen) -> Mapping[Any, Located] | None:
-        """The terms' geometry at the positions of the state, if it is known for these frozen data."""
-        known, terms = self.state.evaluation, self.active.with_edges
-        if known is None or any(frozen[term].number != known.step.frozen[term].number for term in terms):
-            return None
-        return known.geometry
 
     def evaluate(self, v: Array) -> Evaluation:
         """The stage at velocities v (n_owned, 3); collective."""
         step, rates, geometry = self.step, self.points.extended(v), None
         if step.stage.x is None and not rates.any():  # where the step starts
-            geometry = self._known_geometry(step.frozen) if self._known_start else None
+            geometry = self.state.geometry(step.frozen) if self.state.starts(step) else None
         return self.revisit(self.at(step.stage.c * rates + step.x_h, rates, geometry))
 
     def linearised(self, v: Array) -> Evaluation:
@@ -327,8 +301,8 @@ class StageEquations:
         """
         if not self.step.linear:
             return self.evaluate(v)
-        x_h, known = self.step.x_h, self._known_start
-        geometry = self._known_geometry(self.step.frozen) if known else None
+        x_h, known = self.step.x_h, self.state.starts(self.step)
+        geometry = self.state.geometry(self.step.frozen) if known else None
         forces = known.internal if known and self._starts_next(known.step) else None
         self.state.evaluation = None
         return self.revisit(Evaluation(self.step, x_h, np.zeros_like(x_h), self.forces, forces, geometry))
@@ -356,11 +330,6 @@ class StageEquations:
         if not step.ends_at_stage:  # handles do not have the integrator's accelerations
             held.overwrite(rate, (self.v[:n] - step.v_h).take(held.indices) / step.dt)
         return self.forces.parts(self.evaluated, rate)
-
-    @property
-    def stage_velocity(self) -> Array:
-        """Velocities (n_owned, 3) [m/s] of the stage of the step just accepted."""
-        return self.evaluated.v[: len(self.mass)]
 
     def displacement(self, v: Array, increment: Array) -> tuple[Array, Array]:
         """Stage positions at velocities v (n_owned, 3), and displacements from there, both (n_local, 3) [m].
@@ -413,6 +382,6 @@ class StageEquations:
         """
         self.contact_before = self.contact_end
         if self.integrator is not self.integrators.usual:
-            rate = (self.stage_velocity - v_before) / self.step.dt
+            rate = (self.evaluated.v[: len(self.mass)] - v_before) / self.step.dt
             moves = self.step.prescribed.free & (self.mass[:, None] > 0.0)
             self.integrators.follow_step(np.where(moves, rate, 0.0))

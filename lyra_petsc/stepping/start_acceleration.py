@@ -100,7 +100,7 @@ class StartAcceleration:
             at_start = step.changed(frozen=active.with_targets(step.frozen, there))
         else:
             at_start = step
-        geometry = state.geometry or Evaluation(at_start, state.x, v, forces).geometry
+        geometry = (state.evaluation or Evaluation(at_start, state.x, v, forces)).geometry
         if forces.damps and layout.n_edges_global:
             self._balance_moments(at_start, v, geometry)
         force = self._out_of_balance(at_start, v, geometry)

@@ -11,8 +11,9 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.linear.discretisation import Discretisation
 
 if TYPE_CHECKING:
+    from lyra_petsc.stepping.active_terms import Frozen
     from lyra_petsc.stepping.prescribed import PrescribedUnknowns
-    from lyra_petsc.stepping.time_step import Evaluation
+    from lyra_petsc.stepping.time_step import Evaluation, TimeStep
     from lyra_petsc.terms.protocols import Located
 
 
@@ -29,11 +30,6 @@ class State:
 
     _past_velocity: Array | None = None
     evaluation: Evaluation | None = None
-
-    @property
-    def geometry(self) -> Mapping[Any, Located] | None:
-        """The terms' geometry at these positions, if it is known."""
-        return None if self.evaluation is None else self.evaluation.geometry
 
     def __init__(self, discretisation: Discretisation) -> None:
         self._discretisation = discretisation
@@ -85,6 +81,15 @@ class State:
         held.overwrite(displacement[:n], float(steps) * (held.goal - self.x[:n].take(held.indices)))
         layout.update_ghosts(displacement)
         return displacement
+
+    def starts(self, step: TimeStep) -> Evaluation | None:
+        """The `evaluation`, if it is the end of the last step and ``step`` follows."""
+        known = self.evaluation
+        return known if known is not None and known.step.end == step.start else None
+
+    def geometry(self, frozen: Frozen) -> Mapping[Any, Located] | None:
+        """The terms' geometry at these positions, if it is known with these frozen data."""
+        return None if self.evaluation is None else self.evaluation.geometry_with(frozen)
 
     def forget(self) -> None:
         """Free what is known at these positions, which the step has left."""

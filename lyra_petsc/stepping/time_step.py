@@ -139,6 +139,11 @@ class Evaluation:
         frozen = self.step.frozen
         return {term: term.at(self.x, frozen[term]) for term in self.forces.active.with_geometry}
 
+    def geometry_with(self, frozen: Mapping[Term, Any]) -> Mapping[Any, Located] | None:
+        """The `geometry`, if the directors' frames are the same in these frozen data."""
+        own, terms = self.step.frozen, self.forces.active.with_edges
+        return self.geometry if all(frozen[term].number == own[term].number for term in terms) else None
+
     @cached_property
     def frozen(self) -> Mapping[Term, Any]:
         """Data of each term that are constant in the step, with its geometry here."""

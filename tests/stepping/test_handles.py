@@ -11,6 +11,7 @@ from mpi4py import MPI
 from physics import CLOTH, Simulation, grid, rotation, scene_of
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.output.fields import FIELDS
 from lyra_petsc.scene.schema import Keyframe, Obstacle
 from lyra_petsc.terms.handles.motion import Motion, Window, motion_of
 from lyra_petsc.terms.handles.spring import Spring
@@ -246,7 +247,7 @@ def test_held_vertices_follow_the_motion_in_every_step(
             simulation.step(DT)
             expected = motion.moved(start, 0.0, simulation.time)
             np.testing.assert_allclose(simulation.x[nodes], expected, rtol=0.0, atol=1e-15)
-            written = simulation.gather(simulation.equations.output_velocity())[nodes]
+            written = simulation.gather(FIELDS["velocity"].compute(simulation.problem))[nodes]
             np.testing.assert_allclose(written, motion.velocity(start, 0.0, simulation.time), atol=1e-12)
             assert step < 2 or np.abs(simulation.x[19] - start[0]).max() > 0.0
 
