@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array, Ints, unwritable
+from lyra_petsc.arrays import Array, unwritable
 from lyra_petsc.contact import contact_pairs, one_sided, pair_distances, pair_motion
 from lyra_petsc.contact.barrier_law import barrier as barrier_law
 from lyra_petsc.contact.barrier_pairs import barrier_pairs
@@ -26,8 +26,15 @@ from lyra_petsc.contact.contact_setup import HALFWAY_CURVATURE, Barrier, surface
 from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles
 from lyra_petsc.contact.one_sided import Springs
 from lyra_petsc.contact.pair_distances import EDGE_EDGE
-from lyra_petsc.contact.pairs import Contacts, NearPairs, chosen, no_near_pairs
-from lyra_petsc.contact.position_cache import PositionCache
+from lyra_petsc.contact.pairs import (
+    NO_PAIRS,
+    ActiveAt,
+    ActivePairs,
+    Contacts,
+    NearPairs,
+    chosen,
+    no_near_pairs,
+)
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.scene.schema import Scene
@@ -43,43 +50,6 @@ TARGET_TOLERANCE = 0.05
 
 MAX_DEVIATION = 0.1
 """Largest deviation over the gap of an obstacle's paths from straight lines, where these are used instead."""
-
-
-class ActivePairs(NamedTuple):
-    """Pairs nearer than the gap; of those with the same nearest vertices only one.
-
-    Attributes
-    ----------
-    lower_bound : (E,)
-        Lower bound of the distance less offset [m] of every pair, exact below the gap.
-    pair, weight, owned_weight, beta, energy, derivatives : (m, …)
-        Data of the active pairs, as `contact_pairs.find_active` writes them.
-    """
-
-    lower_bound: Array
-    pair: Ints
-    weight: Array
-    owned_weight: Array
-    beta: Array
-    energy: Array
-    derivatives: Array
-
-    @property
-    def square(self) -> Array:
-        """|g|² [m²], (m,)."""
-        g = self.derivatives[:, :3]
-        square: Array = np.einsum("mk,mk->m", g, g)
-        return square
-
-    @property
-    def stiffness(self) -> Array:
-        """b″ times the mollifier [N/m], (m,)."""
-        return self.derivatives[:, 5] * self.derivatives[:, 4] * self.square
-
-    @property
-    def forces(self) -> tuple[Ints, Array, Array, Array]:
-        """The arguments of kernels: pair, weight, β and derivatives."""
-        return self.pair, self.weight, self.beta, self.derivatives
 
 
 class Pair(NamedTuple):
@@ -100,11 +70,6 @@ class Pair(NamedTuple):
     thickness: float
 
 
-_EMPTY = np.empty(0)
-_EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 6))
-NO_PAIRS = ActivePairs(*unwritable(_EMPTY, *_EMPTY_ROWS))
-
-
 class ContactBarrier(LimitsStep):
     """The barrier energy of all near pairs.
 
@@ -117,7 +82,7 @@ class ContactBarrier(LimitsStep):
         self.search, self.static = search, False
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32)))
-        self._capacity = 0
+        self._capacity = self._set_number = 0
         self.set_pairs(no_near_pairs(), self.stencil, 0)
 
     def set_up(
@@ -142,7 +107,7 @@ class ContactBarrier(LimitsStep):
         self.set_elements(Elements(stencil, n_owned=n_counted))
         of_search = self.obstacles, self.search.obstacle_x
         self.pairs = barrier_pairs(pairs, self.stencil, self.barrier, *of_search)
-        self._active_at = PositionCache(self._find_active)
+        self._set_number += 1
         self._expected = np.full(self.n_elements, np.nan)
         self._springs: Springs | None = None
 
@@ -161,14 +126,6 @@ class ContactBarrier(LimitsStep):
         """The pairs nearer than the gap for positions x (n_local, 3) [m] and obstacle_x (m, 3) [m]."""
         if not self.n_elements:
             return NO_PAIRS
-        return ActivePairs(*self._active_at(np.concatenate([x, obstacle_x])))
-
-    def _acting_pairs(self, x: Array, frozen: ObstaclePositions) -> ActivePairs:
-        """The pairs with forces in the equations of a step, at positions x (n_local, 3) [m] at its end."""
-        return self.active_pairs(x, frozen.end) if frozen.act else NO_PAIRS
-
-    def _find_active(self, points: Array) -> tuple[NDArray[Any], ...]:
-        x, obstacle_x = np.split(points, [len(points) - self.obstacles.n_points])
         lower_bound = np.empty(self.n_elements)
         data = *self._pair_data, self.pairs.shares, self.n_owned
         while True:
@@ -177,8 +134,19 @@ class ContactBarrier(LimitsStep):
             arrays = *integers, np.empty((capacity, 4)), np.empty(capacity), np.empty((capacity, 6))
             active = contact_pairs.find_active(x, obstacle_x, *data, lower_bound, arrays)
             if active <= capacity:
-                return lower_bound, *(values[:active] for values in arrays)
+                return ActivePairs(*unwritable(lower_bound, *(values[:active] for values in arrays)))
             self._capacity = active + active // 4
+
+    def at(self, x: Array, frozen: ObstaclePositions) -> ObstaclePositions:
+        """The obstacles with the pairs that are active with the sheets at positions x (n_local, 3) [m]."""
+        return frozen._replace(active=ActiveAt(self._set_number, lambda: self._acting_pairs(x, frozen)))
+
+    def _acting_pairs(self, x: Array, frozen: ObstaclePositions) -> ActivePairs:
+        """The pairs with forces in the equations of a step, at positions x (n_local, 3) [m] at its end."""
+        here = frozen.active
+        if here is not None and here.set_number == self._set_number:
+            return here.pairs
+        return self.active_pairs(x, frozen.end) if frozen.act else NO_PAIRS
 
     @property
     def _pair_data(self) -> tuple[Any, ...]:
@@ -187,7 +155,7 @@ class ContactBarrier(LimitsStep):
 
     def energies(self, x: Array, frozen: ObstaclePositions) -> Array:
         if not self.n_elements:
-            return _EMPTY
+            return np.empty(0)
         active = self._acting_pairs(x, frozen)
         counted = active.owned_weight != 0.0  # only owned pairs, which come first
         energies = (active.owned_weight * active.energy)[counted]
@@ -398,9 +366,7 @@ class ContactBarrier(LimitsStep):
             points = self.pairs.points[blocked & (self.pairs.obstacle == number)]
             points = np.unique(points[points >= 0])
             moved[points] = (x @ rotation.T + translation - x)[points]
-        for points in self.pairs.points[
-            blocked & (self.pairs.obstacle < 0)
-        ]:  # a moved sheet moves the next one
+        for points in self.pairs.points[blocked & (self.pairs.obstacle < 0)]:  # a sheet moves the next one
             changed = (moved[points] != dx[points]).any(axis=1)
             if changed.any():
                 moved[points[~changed]] = moved[points[changed]][0]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import surface_shares
-from lyra_petsc.contact.pairs import Rows
+from lyra_petsc.contact.pairs import ActiveAt, Rows
 from lyra_petsc.mesh.obstacles import Container, Solid
 
 SHARP_ANGLE = 0.5
@@ -28,12 +28,15 @@ class ObstaclePositions(NamedTuple):
         Rotation and translation [m] of each obstacle in the step.
     act : bool
         Whether contact is part of the equations of the step.
+    active : ActiveAt or None
+        The active pairs, where these obstacles belong to an evaluation.
     """
 
     start: Array
     end: Array
     motions: list[tuple[Array, Array]]
     act: bool
+    active: ActiveAt | None = None
 
     def part(self, begin: float, end: float) -> ObstaclePositions:
         """The obstacles between two fractions of the step, on straight lines."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.arrays import Array, Ints, Mask, unwritable
 
 Rows = NDArray[np.int32] | NDArray[np.int64]
 """Local rows of vertices."""
@@ -200,3 +202,65 @@ def no_friction_pairs() -> FrictionPairs:
     """No pairs."""
     key, vertices = (np.empty((0, n), dtype=np.int64) for n in (10, 4))
     return new_friction_pairs(key, vertices, np.empty((0, 3)), np.empty(0, dtype=np.bool_))
+
+
+class ActivePairs(NamedTuple):
+    """Pairs nearer than the gap; of those with the same nearest vertices only one.
+
+    Attributes
+    ----------
+    lower_bound : (E,)
+        Lower bound of the distance less offset [m] of every pair, exact below the gap.
+    pair, weight, owned_weight, beta, energy, derivatives : (m, …)
+        Data of the active pairs, as `contact_pairs.find_active` writes them.
+    """
+
+    lower_bound: Array
+    pair: Ints
+    weight: Array
+    owned_weight: Array
+    beta: Array
+    energy: Array
+    derivatives: Array
+
+    @property
+    def square(self) -> Array:
+        """|g|² [m²], (m,)."""
+        g = self.derivatives[:, :3]
+        square: Array = np.einsum("mk,mk->m", g, g)
+        return square
+
+    @property
+    def stiffness(self) -> Array:
+        """b″ times the mollifier [N/m], (m,)."""
+        return self.derivatives[:, 5] * self.derivatives[:, 4] * self.square
+
+    @property
+    def forces(self) -> tuple[Ints, Array, Array, Array]:
+        """The arguments of kernels: pair, weight, β and derivatives."""
+        return self.pair, self.weight, self.beta, self.derivatives
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveAt:
+    """The active pairs at the positions of an evaluation, found when they are first needed.
+
+    Attributes
+    ----------
+    set_number : int
+        Another one for each set of near pairs, of which `ActivePairs.pair` are numbers.
+    find : callable
+    """
+
+    set_number: int
+    find: Callable[[], ActivePairs]
+
+    @cached_property
+    def pairs(self) -> ActivePairs:
+        """The pairs."""
+        return self.find()
+
+
+_EMPTY = np.empty(0)
+_EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 6))
+NO_PAIRS = ActivePairs(*unwritable(_EMPTY, *_EMPTY_ROWS))

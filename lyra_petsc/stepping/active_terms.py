@@ -55,8 +55,8 @@ class ActiveTerms:
         Terms that limit the length of steps, besides contact.
     stateful, dissipating : list of Stateful
         Terms with a state; those of which steps make heat.
-    of_contact, sliding : list of Elastic
-        The terms of contact, and friction alone, if there are any.
+    of_contact, sliding, barriers : list of Elastic
+        The terms of contact, friction alone, and the barrier alone, if there are any.
     with_edges, with_geometry : list of Elastic
         Terms with directors; those of which several methods need the same geometry.
     coarse : dict of Elastic → Elastic
@@ -80,6 +80,7 @@ class ActiveTerms:
         self.stateful = [term for term in self.elastic if isinstance(term, Stateful)]
         self.sliding: list[Any] = [term for term in self.external if term.registration.of_contact]
         self.of_contact: list[Any] = [term for term in self.elastic if term.registration.of_contact]
+        self.barriers = [term for term in self.of_contact if term not in self.sliding]
         self.with_edges = [term for term in self.elastic if isinstance(term, HasDirectors)]
         self.with_geometry = [term for term in self.elastic if isinstance(term, HasGeometry)]
         self.coarse: dict[Elastic, Elastic] = {}

@@ -166,6 +166,7 @@ class StageEquations:
                 term.initialise_pairs(self.x, self.step.frozen[term])
             self.contact_before = self.contact.finish(self._finished(), self.step.frozen, None)
         self.nears_limit = self.active.limits_act(self.x, self.step.frozen, self.points)
+        self.evaluated = self.at(self.x, self.v)
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -366,11 +367,10 @@ class StageEquations:
 
         Returns whether the pattern changed; collective.
         """
-        frozen = self.step.frozen
-        terms = self.active.of_contact if self.near else []
-        acting = {term.name: term.active_elements(self.evaluated.x, frozen[term]) for term in terms}
-        number = sum(int(np.count_nonzero(mask)) for mask in acting.values())
-        self.has_active_pairs = bool(acting) and any(self.points.global_max(number))
+        here, terms = self.evaluated, self.active.of_contact if self.near else []
+        acting = {term.name: term.active_elements(here.x, here.frozen[term]) for term in terms}
+        acts = any(mask.any() for mask in acting.values())
+        self.has_active_pairs = bool(acting) and any(self.points.global_max(acts))
         changed = self.discretisation.update_pattern(acting)
         if changed:
             self.forces.forget_pattern()

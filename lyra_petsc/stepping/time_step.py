@@ -146,8 +146,10 @@ class Evaluation:
 
     @cached_property
     def frozen(self) -> Mapping[Term, Any]:
-        """Data of each term that are constant in the step, with its geometry here."""
-        return self.forces.active.refreeze(self.step.frozen, self.geometry)
+        """Data of each term that are constant in the step, with its geometry or active pairs here."""
+        active, frozen = self.forces.active, self.step.frozen
+        pairs = {term: term.at(self.x, frozen[term]) for term in active.barriers}
+        return active.refreeze(frozen, {**self.geometry, **pairs})
 
     @cached_property
     def internal(self) -> Array:

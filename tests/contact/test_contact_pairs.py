@@ -121,7 +121,7 @@ def blocks_of(
 
 
 def found_active(*given: Any, counted: int, capacity: int | None = None) -> dict[str, NDArray[Any]]:
-    """The results of `contact_pairs.find_active` by name, read-only as from `PositionCache`."""
+    """The results of `contact_pairs.find_active` by name, read-only as those of `ActivePairs`."""
     n = len(given[2])
     capacity = n if capacity is None else capacity
     least, found = np.empty(n), {"at": np.empty(capacity, dtype=np.int64), "weight": np.empty(capacity)}
