@@ -184,7 +184,7 @@ def report():
     files = {os.readlink(f"/proc/self/fd/{fd}") for fd in files if os.path.lexists(f"/proc/self/fd/{fd}")}
     lines = [line.split() for kind in ("tcp", "tcp6", "udp", "udp6") for line in open(f"/proc/net/{kind}")]
     sockets = [words[1] for words in lines if words[3] in ("0A", "07") and f"socket:[{words[9]}]" in files]
-    print("MPI" if "mpi4py.MPI" in sys.modules else "no MPI", sockets)
+    sys.stdout.write(f"{'MPI' if 'mpi4py.MPI' in sys.modules else 'no MPI'} {sockets}\\n")
 
 from lyra_petsc.__main__ import main
 atexit.register(report)
