@@ -159,7 +159,7 @@ class StretchLimit(LimitsStep):
         corners, moves = x[stencil], dx[stencil]
         numbers = np.arange(3 * len(rows), dtype=np.int32).reshape(-1, 3)
         for _ in range(SECANTS):
-            done += (1.0 - done) * np.maximum(bound - low, 0.0) / np.maximum(high - low, bound - low)
+            done += (1.0 - done) * np.maximum(bound - low, 0.0) / np.maximum(high - low, np.finfo(float).tiny)
             at = (corners + done[:, None, None] * moves).reshape(-1, 3)
             low = principal_stretches(at, numbers, inverse, len(rows))[:, 1]
         return float(done.min())

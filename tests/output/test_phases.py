@@ -1,8 +1,11 @@
 """Wall times of the phases of a run."""
 
+import numba
 import pytest
+from petsc4py import PETSc
 
-from lyra_petsc.phases import Phases
+from lyra_petsc.kernels.compilation import COMPILATION
+from lyra_petsc.phases import COMPILE, Phases
 
 
 class Clock:
@@ -51,3 +54,14 @@ def fail_inside(phases: Phases, clock: Clock) -> None:
     with phases("solve"):
         clock.now += 1
         raise RuntimeError
+
+
+def test_compilation_of_a_kernel_is_a_phase_and_an_event(monkeypatch: pytest.MonkeyPatch) -> None:
+    phases = Phases()
+    monkeypatch.setattr(COMPILATION, "begins", phases.begin_compilation)
+    monkeypatch.setattr(COMPILATION, "ends", phases.end_compilation)
+    PETSc.Log.begin()
+    before = COMPILE.getPerfInfo()["count"]
+    assert numba.njit(lambda number: number + 1)(2) == 3
+    assert COMPILE.getPerfInfo()["count"] == before + 1
+    assert 0.0 < phases.seconds()["compilation"] <= phases.total
