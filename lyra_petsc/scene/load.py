@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.messages import dotted, validated
 from lyra_petsc.scene.overrides import apply_changes, apply_overrides, plain
@@ -117,8 +118,21 @@ def _load_checked(
     if meshes_needed:
         for key, mesh in scene.mesh_files.items():
             _check_mesh_file(mesh, dotted(key, data), source)
-    scene._source, scene._content, scene._directory = source, data, directory
+    scene._source, scene._content, scene._directory = source, _with_points(data, scene), directory
     return scene
+
+
+def _with_points(data: Any, value: Any) -> Any:
+    """``data`` with the points of curves in place of their files, as the checked ``value`` has them: changed
+    scenes need no file.
+    """
+    if isinstance(data, dict) and isinstance(value, (Block, dict)):
+        return {key: _with_points(entry, value.get(key)) for key, entry in data.items()}
+    if isinstance(data, dict) and isinstance(value, list):  # a single block in place of a list
+        return _with_points(data, value[0])
+    if isinstance(data, list) and isinstance(value, (list, tuple)):
+        return [_with_points(*pair) for pair in zip(data, value, strict=False)]
+    return plain(value) if isinstance(data, str) and isinstance(value, tuple) else data
 
 
 def _read_plain(path: Path, text: str) -> tuple[Any, list[str]]:
