@@ -63,6 +63,29 @@ class InputError(LyraError):
         return (_rebuild_input_error, (self.message, self.file, self.key))
 
 
+class MarkedError(InputError):
+    """Bad input at places that a picture can show.
+
+    Attributes
+    ----------
+    places : object
+        What `show` needs to draw them.
+    """
+
+    def __init__(
+        self, message: str, places: object, *, file: object | None = None, key: str | None = None
+    ) -> None:
+        super().__init__(message, file=file, key=key)
+        self.places = places
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuild_marked_error, (self.message, self.places, self.file, self.key)
+
+
+def _rebuild_marked_error(message: str, places: object, file: str | None, key: str | None) -> MarkedError:
+    return MarkedError(message, places, file=file, key=key)
+
+
 def _rebuild_input_error(message: str, file: str | None, key: str | None) -> InputError:
     return InputError(message, file=file, key=key)
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from lyra_petsc.arrays import Ints
+from lyra_petsc.cli.marked_places import places_shown
 from lyra_petsc.cli.run import read_scene, say
 from lyra_petsc.mesh.gmsh_sandbox import describe_sandbox, supported_layers
 from lyra_petsc.mesh.topology import connected_pieces
@@ -40,7 +41,8 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_m
     """
     path = path or default_scene()
     scene = read_scene(comm, path, settings, trust_mesh=trust_mesh)
-    simulation = SteppedScene(comm, scene, Phases(report=say))
+    with places_shown(comm):
+        simulation = SteppedScene(comm, scene, Phases(report=say))
     Recorder(simulation)
     problem = simulation.problem
     points, pattern = problem.points, problem.pattern

@@ -13,6 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
+from lyra_petsc.cli.marked_places import places_shown
 from lyra_petsc.cli.progress import ProgressBar, closing_table
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.kernels.ahead import CompilationAhead
@@ -71,7 +72,9 @@ def run(
     path = scene or default_scene()
     choice = choose_folder(comm, path.stem, out, force=force, resume=resume)
     loaded = read_scene(comm, path, settings, trust_mesh=trust_mesh)
-    simulate(comm, loaded, choice, TerminalProgress(comm, served, choice.first), stop.signal_number, phases)
+    progress = TerminalProgress(comm, served, choice.first)
+    with places_shown(comm):
+        simulate(comm, loaded, choice, progress, stop.signal_number, phases)
 
 
 def say(text: str) -> None:

@@ -1,4 +1,4 @@
-"""Overlaps of sheets with obstacles, and refusal of start positions in which contact cannot begin.
+"""Overlaps of sheets with obstacles.
 
 An overlap is a vertex, edge or triangle of a sheet that is in an obstacle deeper than rounding (`ROUNDING`
 times the largest coordinate); to touch an obstacle is no overlap. Triangle meshes as obstacles, closed or
@@ -8,20 +8,17 @@ open, are overlapped by triangles that cross them only (`mutual_crossings`). Con
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints, Mask
-from lyra_petsc.contact.crossings import mutual_crossings, self_crossings
-from lyra_petsc.errors import InputError
+from lyra_petsc.contact.crossings import mutual_crossings
 from lyra_petsc.kernels.cache import cached, inner
-from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.symmetry import Wall, symmetry_walls
+from lyra_petsc.mesh.symmetry import Wall
 from lyra_petsc.mesh.topology import unique_edges
-from lyra_petsc.scene.schema import Scene
 
 ROUNDING = 1e-14
 """Depth that may be rounding, over the largest coordinate or radius: about fifty units in the last place."""
@@ -236,81 +233,6 @@ def _dot(a: Any, b: Any) -> float:
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-MAX_LISTED = 3
-"""Number of triangles, or pairs of triangles, that a message lists."""
-
-
-def refuse_crossings(
-    scene: Scene,
-    mesh: Mesh,
-    positions: Array,
-    obstacles: Sequence[Solid | Container],
-    time: float = 0.0,
-    when: str = "at the start",
-) -> None:
-    """Refuse positions at which a run begins or is resumed if triangles cross, or overlap an obstacle.
-
-    Parameters
-    ----------
-    scene : Scene
-        A scene with ``contact``.
-    mesh : Mesh
-    positions : (V, 3) float64
-        Positions [m].
-    obstacles : sequence of Solid or Container
-    time : float
-        Time [s] at which the obstacles are where they are, described by ``when``.
-
-    Raises
-    ------
-    InputError
-        The message gives the first triangles and their positions.
-    """
-    assert scene.contact is not None
-    triangles = mesh.triangles
-
-    def refuse(key: str, count: str, listed: Iterable[str], remedy: str) -> None:
-        first = ", ".join(listed)
-        message = f"{when} {count} (counted from 0, the first: {first}); {remedy}"
-        raise InputError(message, file=scene.source, key=key)
-
-    def around(*numbers: int) -> str:
-        x, y, z = positions[triangles[list(numbers)]].mean(axis=(0, 1))
-        return f"around ({x:.4g}, {y:.4g}, {z:.4g}) m"
-
-    if scene.contact.self and len(pairs := self_crossings(positions, triangles)):
-        refuse(
-            "contact",
-            _counted(len(pairs), "pair", "of triangles", "cross"),
-            (f"{a} and {b} {around(a, b)}" for a, b in pairs[:MAX_LISTED].tolist()),
-            "move the sheets apart, or give self: false",
-        )
-    for wall in symmetry_walls(scene, mesh):
-        if len(passing := behind_wall(positions, triangles, wall).triangles):
-            plane = wall.container.name
-            count = f"{_counted(len(passing), 'triangle', 'of the sheet', 'reach')} through the {plane}"
-            listed = (f"{a} {around(a)}" for a in passing[:MAX_LISTED].tolist())
-            key = f"handles[{wall.handle}].symmetry"
-            refuse(key, count, listed, "move the sheet to one side, or give contact: {self: false}")
-    remedy = "move the sheet, or the obstacle"
-    for obstacle in obstacles:
-        key, shape = f"obstacles.{obstacle.name}", (scene.obstacles or {})[obstacle.name]
-        if shape.mesh is not None and isinstance(obstacle, Solid):
-            surface = obstacle.positions(time), obstacle.triangles
-            pairs = mutual_crossings(positions, triangles, *surface)
-            if len(pairs):
-                listed = (f"{a} and {b} {around(a)}" for a, b in pairs[:MAX_LISTED].tolist())
-                count = _counted(len(pairs), "pair", "of triangles of sheet and obstacle", "cross")
-                refuse(key, count, listed, remedy)
-            continue
-        inside = find_overlaps(obstacle, positions, triangles, time, is_box=shape.box is not None).triangles
-        if len(inside):
-            where = "into it" if isinstance(obstacle, Solid) else "beyond it"
-            listed = (f"{a} {around(a)}" for a in inside[:MAX_LISTED].tolist())
-            count = _counted(len(inside), "triangle", "of the sheet", "reach")
-            refuse(key, f"{count} {where}", listed, remedy)
-
-
 def find_overlaps(
     obstacle: Solid | Container, positions: Array, triangles: Ints, time: float, *, is_box: bool
 ) -> Overlaps:
@@ -330,8 +252,3 @@ def find_overlaps(
         return inside_box(*sheet, points)
     crossed = mutual_crossings(*sheet, points, obstacle.triangles)[:, 0]
     return Overlaps(np.empty(0, np.int64), np.empty((0, 2), np.int64), np.unique(crossed))
-
-
-def _counted(count: int, noun: str, of: str, verb: str) -> str:
-    """Subject and verb of a message: ``1 triangle of the sheet reaches``, ``2 triangles … reach``."""
-    return f"{count} {noun} {of} {verb}es" if count == 1 else f"{count} {noun}s {of} {verb}"

@@ -93,7 +93,7 @@ def _refuse_crossings(simulation: SteppedScene, checkpoint: Path) -> None:
     scene, mesh = simulation.scene, simulation.problem.mesh
     if scene.contact is None or mesh is None:
         return
-    from lyra_petsc.contact.overlaps import refuse_crossings  # with kernels
+    from lyra_petsc.contact.start_crossings import refuse_crossings  # with kernels
     from lyra_petsc.mesh.obstacles import build_obstacles
 
     with open_stored(checkpoint) as file:

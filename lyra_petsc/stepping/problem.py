@@ -236,7 +236,7 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
         data |= start_velocities(scene.initial, mesh, rest.mass, file=scene.source)
     positions = None
     if scene.contact is not None:
-        from lyra_petsc.contact.overlaps import refuse_crossings  # with kernels
+        from lyra_petsc.contact.start_crossings import refuse_crossings  # with kernels
         from lyra_petsc.mesh.obstacles import build_obstacles
 
         positions = data.get("start", mesh.positions)
