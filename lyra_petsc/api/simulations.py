@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Any, Literal
@@ -12,14 +13,24 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.api.controls import drive
 from lyra_petsc.api.scenes import SceneLike, load
-from lyra_petsc.arrays import Array
-from lyra_petsc.errors import InputError, suggest
+from lyra_petsc.arrays import Array, Ints, unwritable
+from lyra_petsc.errors import InputError, python_argument_names, suggest
 from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.output.checkpoint import Checkpoint
+from lyra_petsc.output.continuation import checkpoint_of, take
 from lyra_petsc.output.fields import FIELDS, check_field
+from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.parallel import on_root, restore_signal_handlers
-from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.driven_curve import DrivenCurve
+from lyra_petsc.scene.messages import validated
+from lyra_petsc.scene.schema import Keyframe, Scene
+from lyra_petsc.scene.values import shown
+from lyra_petsc.stepping.outside_changes import ProgramForces, add_forces, set_state
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.handles.driven_motion import DrivenMotion
+from lyra_petsc.terms.handles.motion import Motion
 
 restore_signal_handlers()  # PETSc's import has replaced the signal handlers
 
@@ -61,6 +72,28 @@ class Step:
     wall_seconds: float
 
 
+@dataclass(frozen=True)
+class SavedState:
+    """A state that `Simulation.restore` returns to.
+
+    Attributes
+    ----------
+    checkpoint : Checkpoint
+        What a checkpoint of a run holds, on this rank.
+    driven : dict
+        How all that is driven goes on.
+    forces : (n, 3) or None
+        The forces [N] that the program has set.
+    jumps : tuple of float
+        Times [s] at which forces jump.
+    """
+
+    checkpoint: Checkpoint
+    driven: dict[str, Any]
+    forces: Array | None
+    jumps: tuple[float, ...]
+
+
 class Simulation:
     """A scene in memory, stepped through by iteration; writes no files. Every method is collective.
 
@@ -78,6 +111,9 @@ class Simulation:
     scene : Scene, path or mapping
     comm : MPI.Comm, optional
         Default COMM_WORLD.
+    drives : iterable of str
+        What the program moves or changes in time: ``handles[0]``, ``obstacles.ball``, ``gravity``,
+        ``wind.velocity``, ``loads[0].pressure``, …
     trust_mesh : bool
         Let this scene's scripts (.geo) read any file, and run where there is no seccomp.
 
@@ -98,20 +134,36 @@ class Simulation:
         On all ranks, if the scene cannot be simulated.
     """
 
-    def __init__(self, scene: SceneLike, comm: MPI.Comm | None = None, *, trust_mesh: bool = False) -> None:
+    def __init__(
+        self,
+        scene: SceneLike,
+        comm: MPI.Comm | None = None,
+        *,
+        drives: Iterable[str] = (),
+        trust_mesh: bool = False,
+    ) -> None:
         self.comm: MPI.Comm = MPI.COMM_WORLD if comm is None else comm
+        names = (drives,) if isinstance(drives, str) else tuple(drives)
         loaded = on_root(self.comm, lambda: load(scene, trust_mesh=trust_mesh))
         self.scene: Scene = loaded
         refuse_mixed_options(loaded)
-        with np.errstate(over="ignore", invalid="ignore"):
-            stepping = SteppedScene(self.comm, loaded)
-        self._stepping: SteppedScene | None = stepping
-        problem = stepping.problem
+        self._names = names
+        self._stepping: SteppedScene | None = self._start()
+        problem = self._stepping.problem
         self.mesh: Mesh | None = problem.mesh
         self.vertices: NDArray[np.int64] = problem.points.mesh_vertices
         elements = problem.membrane.elements
         self.triangles: NDArray[np.int64] = elements.index[: elements.n_owned].astype(np.int64)
+        unwritable(self.vertices, self.triangles)
         _OPEN.add(self)
+
+    def _start(self, mesh: Mesh | None = None, owner: Ints | None = None) -> SteppedScene:
+        """The scene at its start; rank 0 may know its mesh and the owners of its vertices."""
+        self._forces: ProgramForces | None = None
+        with python_argument_names():
+            scene, self._driven = drive(self.scene, self._names)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return SteppedScene(self.comm, scene, mesh=mesh, owner=owner)
 
     # -- stepping ------------------------------------------------------------------------------------
 
@@ -165,12 +217,183 @@ class Simulation:
     @property
     def positions(self) -> Array:
         """Current positions (n, 3) [m] of this rank's vertices, a copy."""
-        return self._running.problem.equations.x[: len(self.vertices)].copy()
+        return _handed_out(self._running.problem.equations.x[: len(self.vertices)])
+
+    @positions.setter
+    def positions(self, values: Array) -> None:
+        """Set the positions (n, 3) [m]; vertices that handles hold keep theirs."""
+        self._set_state("positions", values, self.velocities)
 
     @property
     def velocities(self) -> Array:
         """Current velocities (n, 3) [m/s] of this rank's vertices, a copy."""
         return self.field("velocity")
+
+    @velocities.setter
+    def velocities(self, values: Array) -> None:
+        """Set the velocities (n, 3) [m/s]; vertices that handles hold keep theirs."""
+        self._set_state("velocities", self.positions, values)
+
+    def _set_state(self, name: str, positions: Array, velocities: Array) -> None:
+        x, v = self._rows(name, positions), self._rows(name, velocities)
+        run = self._running
+        if self.scene.contact is not None:
+            self._refuse_crossings(x)
+        with np.errstate(over="ignore", invalid="ignore"):
+            set_state(run, x, v)
+
+    def _refuse_crossings(self, positions: Array) -> None:
+        """Refuse positions (n, 3) at which sheets cross each other or obstacles."""
+        run, whole = self._running, self.gather(positions)
+
+        def refuse() -> None:
+            from lyra_petsc.contact.overlaps import refuse_crossings  # with kernels
+            from lyra_petsc.mesh.obstacles import build_obstacles
+
+            assert self.mesh is not None
+            assert whole is not None
+            obstacles = build_obstacles(run.scene, self.mesh.obstacles, Motion)
+            refuse_crossings(run.scene, self.mesh, whole, obstacles, run.time, f"at {run.time_text()}")
+
+        on_root(self.comm, refuse)
+
+    @property
+    def forces(self) -> Array:
+        """Forces (n, 3) [N] on this rank's vertices that the program has set, a copy."""
+        return _handed_out(np.zeros((len(self.vertices), 3)) if self._forces is None else self._forces.forces)
+
+    @forces.setter
+    def forces(self, values: Array) -> None:
+        """Set forces (n, 3) [N] that act on this rank's vertices from now on, besides the scene's loads."""
+        rows = self._rows("forces", values)
+        if self._forces is None:
+            self._forces = add_forces(self._running)
+        self._forces.set(self._running, rows)
+
+    def _rows(self, name: str, values: Any) -> Array:
+        """Finite numbers (n, 3) for this rank's vertices; refuses others on all ranks."""
+        rows = np.asarray(values, dtype=np.float64)
+        problem = ""
+        if rows.shape != (len(self.vertices), 3):
+            problem = f"has shape {rows.shape}, not ({len(self.vertices)}, 3): a row for each of .vertices"
+        elif not np.isfinite(rows).all():
+            problem = "has numbers that are not finite"
+        for text in self.comm.allgather(problem):
+            if text:
+                raise InputError(text, key=f"Simulation.{name}")
+        return rows
+
+    # -- what is driven ----------------------------------------------------------------------------
+
+    def move(
+        self,
+        name: str,
+        *,
+        translate: Iterable[float] = (0.0, 0.0, 0.0),
+        rotate: Mapping[str, Any] | None = None,
+        scale: float | Iterable[float] = 1.0,
+        at: float | None = None,
+    ) -> None:
+        """Move a driven handle or obstacle in a straight line to a place, where it then stays.
+
+        Parameters
+        ----------
+        name : str
+            As in ``drives``: ``handles[0]``, ``obstacles.ball``.
+        translate, rotate, scale
+            As in a keyframe of the scene: from the start, not from the present place.
+        at : float, optional
+            When it is there [s]; by default at the end of the next step.
+
+        Raises
+        ------
+        InputError
+        """
+        motion, run = self._driven_as(name, DrivenMotion, "move"), self._running
+        time = self._time_of(at)
+        place = {"time": time, "translate": list(translate), "rotate": rotate, "scale": scale}
+        with python_argument_names():
+            target = validated(Keyframe, {k: v for k, v in place.items() if v is not None}, file=None)
+        if motion.go_to(target, run.time):
+            run.expect_jump(run.time)
+        run.follow_driven(time)
+
+    def set(self, name: str, value: Any, *, at: float | None = None) -> None:
+        """Change a driven value of the scene now, or in a straight line until a time.
+
+        Parameters
+        ----------
+        name : str
+            As in ``drives``: ``gravity``, ``wind.velocity``, ``loads[0].pressure``.
+        value : float or (3,)
+        at : float, optional
+            When it has this value [s]; by default now.
+        """
+        curve, run = self._driven_as(name, DrivenCurve, "set"), self._running
+        number = np.asarray(value, dtype=np.float64)
+        if number.shape != curve.values[0].shape or not np.isfinite(number).all():
+            raise InputError(f"must be {_shape(curve.values[0])}, not {shown(value)}", key=name)
+        time = run.time if at is None else self._time_of(at)
+        curve.go_to(number, run.time, time)
+        run.expect_jump(run.time)
+        if at is not None:
+            run.expect_jump(time)
+            run.follow_driven(time)
+
+    def _driven_as(self, name: str, kind: type[Any], call: str) -> Any:
+        if name not in self._driven:
+            what = f"is not driven: Simulation(scene, drives=[{name!r}]) lets the program do so"
+            raise InputError(what, key=name)
+        if not isinstance(self._driven[name], kind):
+            other = "move" if call == "set" else "set"
+            raise InputError(f"is changed by {other}(), not {call}()", key=name)
+        return self._driven[name]
+
+    def _time_of(self, at: float | None) -> float:
+        """The time ``at``, or the end of the next step."""
+        run = self._running
+        if at is None:
+            return run.control.next_end(run.time)
+        if not run.time < at < np.inf:
+            raise InputError(f"must be later than now, {run.time:g} s, not {shown(at)}", key="at")
+        return float(at)
+
+    @property
+    def reactions(self) -> dict[str, Array]:
+        """Force (3,) [N] of each handle on the sheet in the last step, by name as in ``drives``."""
+        forces = self._running.energy_balance.handle_forces(len(self.scene.handles))
+        return {f"handles[{number}]": _handed_out(force) for number, force in enumerate(forces)}
+
+    # -- saved states ------------------------------------------------------------------------------
+
+    def save(self) -> SavedState:
+        """The present state in memory, for `restore`."""
+        held = checkpoint_of(self._running)
+        kept = copy.deepcopy(held)
+        driven = {name: function.saved_state() for name, function in self._driven.items()}
+        forces = None if self._forces is None else self._forces.forces.copy()
+        return SavedState(kept, driven, forces, self._running.jumps)
+
+    def restore(self, saved: SavedState) -> None:
+        """Return to a state that this simulation has saved; it goes on as it went on from there."""
+        self.reset()
+        run = self._running
+        for name, function in self._driven.items():
+            function.restore(saved.driven[name])
+        for time in saved.jumps:
+            run.expect_jump(time)
+        order = FileOrder(self.comm, self.vertices, run.problem.points.n_vertices_global)
+        take(run, saved.checkpoint, order)
+        if saved.forces is not None:
+            self._forces = add_forces(run)
+            self._forces.forces = saved.forces.copy()
+
+    def reset(self) -> None:
+        """Return to the start of the scene, with nothing set by the program."""
+        owner = self.gather(np.full(len(self.vertices), self.comm.rank))
+        self._running.destroy()
+        self._stepping = None
+        self._stepping = self._start(self.mesh, owner)
 
     def field(self, name: str) -> Array:
         """A field of those that a scene's ``output.fields`` may name, on this rank's vertices or triangles.
@@ -184,7 +407,7 @@ class Simulation:
             raise InputError(f"unknown field {name!r}, {suggest(name, FIELDS)}", key="field")
         problem = self._running.problem
         check_field(FIELDS[name], problem)
-        return np.array(FIELDS[name].compute(problem))
+        return _handed_out(FIELDS[name].compute(problem))
 
     @property
     def energies(self) -> dict[str, float]:
@@ -204,7 +427,8 @@ class Simulation:
         contacts of the magnitudes of normal force and friction [N], (8,), by its name.
         """
         names = list(self.scene.obstacles or {})
-        return dict(zip(names, self._running.energy_balance.obstacle_forces(len(names)), strict=True))
+        loads = self._running.energy_balance.obstacle_forces(len(names))
+        return {name: _handed_out(load) for name, load in zip(names, loads, strict=True)}
 
     @property
     def notes(self) -> list[str]:
@@ -223,7 +447,8 @@ class Simulation:
         """
         numbers = self.vertices if on == "vertex" else self.triangles
         if not self.comm.allreduce(len(rows) == len(numbers), MPI.LAND):
-            raise ValueError(f"a rank has {len(rows)} rows, not one for each {on} of its own")
+            message = f"a rank has {len(rows)} rows, not one for each {on} of its own"
+            raise InputError(f"{message}; give arrays as .positions or .field() return them", key="gather")
         pieces = self.comm.gather((numbers, rows), root=0)
         if pieces is None:
             return None
@@ -238,7 +463,7 @@ class Simulation:
     @property
     def _running(self) -> SteppedScene:
         if self._stepping is None:
-            raise ValueError("this simulation is closed")
+            raise InputError("is closed: make another one, or leave it open until the end", key="Simulation")
         return self._stepping
 
     def close(self) -> None:
@@ -276,3 +501,15 @@ def refuse_mixed_options(scene: Scene) -> None:
             file=scene.source,
             key="petsc",
         )
+
+
+def _handed_out(values: NDArray[Any]) -> Array:
+    """A copy that cannot be written to: what is changed in it would have no effect."""
+    result: Array = np.array(values)
+    unwritable(result)
+    return result
+
+
+def _shape(value: Array) -> str:
+    """What a value like this one is, in words."""
+    return "three finite numbers" if value.ndim else "a finite number"

@@ -29,7 +29,7 @@ _BOX_EDGES = np.array([[i, i + s] for s in (1, 2, 4) for i in range(8) if not i 
 RigidMotion: TypeAlias = Callable[[float], tuple[Array, Array]]
 """Rotation (3, 3) and translation (3,) [m] at a time [s]."""
 
-MotionFactory: TypeAlias = Callable[..., Any]
+MotionFactory: TypeAlias = type[Any]
 """`terms.motion.Motion`, which this package must not import."""
 
 
@@ -172,7 +172,9 @@ def _build_obstacle(
     obstacle = scene.obstacles[name]
     friction = coefficients(scene.contact.friction if obstacle.friction is None else obstacle.friction)
     rigid_motion: RigidMotion | None = None
-    if keyframes := scene.keyframes(obstacle):
+    if isinstance(obstacle.motion, motion):  # of a program that drives it
+        rigid_motion = obstacle.motion.transform
+    elif keyframes := scene.keyframes(obstacle):
         key = f"motions.{obstacle.motion}" if isinstance(obstacle.motion, str) else f"obstacles.{name}.motion"
         rigid_motion = motion(keyframes, obstacle.interpolation, key=key, file=scene.source).transform
     if obstacle.plane is not None:

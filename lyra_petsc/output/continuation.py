@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
@@ -40,6 +41,24 @@ def term_arrays(simulation: SteppedScene) -> TermArrays:
     return TermArrays(vertices.keys(), edges.keys(), elements)
 
 
+def checkpoint_of(simulation: SteppedScene) -> Checkpoint:
+    """What a checkpoint holds of the present state, in views of its arrays; collective."""
+    equations, layout = simulation.problem.equations, simulation.problem.points
+    n, (saved, scalars) = layout.n_owned, simulation.saved_state()
+    stateful = equations.active.stateful
+    rows = {"position": equations.x[:n], "velocity": equations.v[:n], **saved}
+    for number, start in enumerate(sorted(equations.reference.late)):
+        rows[f"start_{number}"] = equations.reference.late[start]
+    arrays = {name: layout.split(values)[0] for name, values in rows.items()}
+    arrays |= term_states.vertex_arrays(stateful)
+    edges: dict[str, NDArray[Any]] = {}
+    if layout.n_edges_global:
+        edges = {name: layout.split(values)[1] for name, values in rows.items()}
+        edges |= term_states.edge_arrays(stateful, layout)
+    elements = term_states.element_arrays(stateful, layout)
+    return Checkpoint(arrays, scalars, Path(), edges=edges, elements=elements)
+
+
 def restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrder) -> None:
     """Restore a simulation from a checkpoint; collective.
 
@@ -56,7 +75,7 @@ def restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrde
                 file=checkpoint.file,
                 key="time.analysis",
             )
-        _restore(simulation, checkpoint, vertices)
+        take(simulation, checkpoint, vertices)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(
             f"does not hold what this program writes ({reason(error)}): run without --resume",
@@ -65,7 +84,8 @@ def restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrde
     on_root(vertices.comm, lambda: _refuse_crossings(simulation, checkpoint.file))
 
 
-def _restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrder) -> None:
+def take(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrder) -> None:
+    """Take the state of a checkpoint whose contents are known to be right; collective."""
     scalars = checkpoint.scalars
     equations, layout = simulation.problem.equations, simulation.problem.points
     arrays = {

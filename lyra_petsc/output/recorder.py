@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.output.checkpoint import read_checkpoint, write_checkpoint
-from lyra_petsc.output.continuation import first_positions, note_changes, restore, term_arrays, used_groups
+from lyra_petsc.output.continuation import (
+    checkpoint_of,
+    first_positions,
+    note_changes,
+    restore,
+    term_arrays,
+    used_groups,
+)
 from lyra_petsc.output.fields import Field, chosen_fields
 from lyra_petsc.output.file_operations import replace_text
 from lyra_petsc.output.layout import SCENE_FILE
@@ -21,7 +28,6 @@ from lyra_petsc.output.run_tables import RunTables
 from lyra_petsc.output.states import FailureState, StateWriter, remove_failure, write_failure
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import Change, dump_scene
-from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 MIN_COST_RATIO = 100.0
@@ -194,21 +200,16 @@ class Recorder:
         A thread of rank 0 completes it while the run goes on: it brings the state to disk, announces it by
         ``announce``, and then does so with the checkpoint, which hence never follows a state that is lost.
         """
-        simulation = self._simulation
-        equations, layout = simulation.problem.equations, simulation.problem.points
-        n, (saved, scalars) = layout.n_owned, simulation.saved_state()
-        stateful = equations.active.stateful
-        rows = {"position": equations.x[:n], "velocity": equations.v[:n], **saved}
-        for number, start in enumerate(sorted(equations.reference.late)):
-            rows[f"start_{number}"] = equations.reference.late[start]
-        arrays = {name: layout.split(values)[0] for name, values in rows.items()}
-        arrays |= term_states.vertex_arrays(stateful)
-        edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
-        edges |= term_states.edge_arrays(stateful, layout)
-        scalars["last_state"] = self._last_state
-        elements = term_states.element_arrays(stateful, layout)
+        held = checkpoint_of(self._simulation)
+        held.scalars["last_state"] = self._last_state
         publish = write_checkpoint(
-            self._folder, self._vertices, arrays, scalars, self._edges, edges, elements
+            self._folder,
+            self._vertices,
+            held.arrays,
+            held.scalars,
+            self._edges,
+            held.edges,
+            held.elements,
         )
 
         def complete() -> None:

@@ -16,6 +16,7 @@ from pydantic_core import CoreSchema
 from typing_extensions import Self
 
 from lyra_petsc.errors import suggest
+from lyra_petsc.scene.sealed import refuse_change, sealed
 from lyra_petsc.scene.values import problem, require, shown
 
 _ENTRY = re.compile(r"(?P<names>\w+(?:, \w+)*)(?: : (?P<kind>.*))?")
@@ -69,7 +70,13 @@ class Block(BaseModel):
     @model_validator(mode="after")
     def _check(self) -> Self:
         self.check()
+        self.__dict__.update(sealed(self.__dict__))
         return self
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_"):
+            refuse_change()
+        super().__setattr__(name, value)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:

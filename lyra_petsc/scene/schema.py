@@ -1000,7 +1000,9 @@ class Scene(Block):
     def keyframes(self, obstacle: Obstacle) -> list[Keyframe]:
         """Keyframes of the motion of an obstacle of the scene; none if it is at rest."""
         motion = obstacle.motion
-        return self.motions[motion] if isinstance(motion, str) else motion or []
+        if isinstance(motion, str):
+            return self.motions[motion]
+        return motion if isinstance(motion, list) else []
 
 
 def _check_keyframes(keyframes: list[Keyframe], *at: str | int) -> None:

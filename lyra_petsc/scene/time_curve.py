@@ -55,6 +55,8 @@ class TimeCurve:
     @classmethod
     def of(cls, value: Any) -> TimeCurve:
         """The curve of a scene's value: of points, or constant."""
+        if isinstance(value, TimeCurve):  # of a program that drives it
+            return value
         points = value if is_curve(value) else ((0.0, value),)
         times, values = zip(*points, strict=True)
         return cls(np.array(times, dtype=np.float64), np.array(values, dtype=np.float64))

@@ -85,6 +85,10 @@ class ActiveTerms:
         self.with_geometry = [term for term in self.elastic if isinstance(term, HasGeometry)]
         self.coarse: dict[Elastic, Elastic] = {}
 
+    def add_load(self, load: Load) -> None:
+        """Let a further load act, which does not follow the shape of the sheet."""
+        self.loads.append(load)
+
     def freeze(self, step: UpcomingStep) -> Frozen:
         """Data of all terms that depend on positions or velocities and are constant in the step."""
         return {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}

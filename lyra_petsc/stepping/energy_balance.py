@@ -171,6 +171,13 @@ class EnergyBalance:
         entries, self._moving_energy, _ = self._measured(self._equations.here())
         self.budget = replace(self.budget, **entries)
 
+    def enter_outside_change(self) -> None:
+        """Enter a change of the state by the program that runs the simulation, as external work."""
+        before = self.budget
+        self.measure()
+        work = before.external_work + self.budget.total - before.total
+        self.budget = replace(self.budget, external_work=work)
+
     def _measured(self, here: Evaluation, *local: float) -> tuple[dict[str, Any], float, list[float]]:
         """Energies of the state, evaluated ``here``, as entries of a `Budget`, the energy of the terms with
         moving targets, and the sums of ``local`` over ranks.

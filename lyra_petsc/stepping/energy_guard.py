@@ -120,7 +120,6 @@ class EndForces:
         self._targets = [*equations.active.moving, *equations.active.external]
         self._plain = [term for term in elastic if term not in self._targets]
         self._weights = [load for load in equations.active.loads if load.registration.energy]
-        self._forces = [load for load in equations.active.loads if not load.registration.energy]
         self._drift = np.array(drift)
         # forces at the start of the step, if known as those at the end of the last, and at its end: gradients
         # of ``_plain``, and forces of the wind
@@ -248,10 +247,11 @@ class EndForces:
     def _load_work(self, ends: tuple[StepEndState, StepEndState], moved: Array) -> float:
         """Work [J] of wind and of loads without a potential on this rank's free coordinates."""
         equations, n = self._equations, len(moved)
-        if not (self._forces or equations.active.viscous):
+        forces = [load for load in equations.active.loads if not load.registration.energy]
+        if not (forces or equations.active.viscous):
             return 0.0
         force = np.zeros_like(ends[1].x)
-        for load in self._forces:
+        for load in forces:
             for end in ends:
                 x = end.x if load.is_follower else ends[1].x
                 load.add_force(x, equations.step.start, equations.step.end, force)

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.linear.petsc_options import fill_gaps, unknown
@@ -71,6 +71,8 @@ class SteppedScene:
         Collects wall time by phase.
     mesh : Mesh, optional
         The scene's mesh on rank 0, if it has been built already.
+    owner : (V,), optional
+        Rank of each vertex, on rank 0, if it is known already.
     stops : sequence of float
         Further times [s] at which a step must end.
 
@@ -111,9 +113,10 @@ class SteppedScene:
         phases: Phases | None = None,
         *,
         mesh: Mesh | None = None,
+        owner: Ints | None = None,
         stops: Sequence[float] = (),
     ) -> None:
-        self.comm, self.scene, self._mesh, self._stops = comm, scene, mesh, list(stops)
+        self.comm, self.scene, self._mesh, self._owner, self._stops = comm, scene, mesh, owner, list(stops)
         self.phases = phases or Phases()
         COMPILATION.begins, COMPILATION.ends = self.phases.begin_compilation, self.phases.end_compilation
         self._filled = fill_gaps(scene.petsc)
@@ -126,7 +129,7 @@ class SteppedScene:
             raise
 
     def _set_up(self, scene: Scene) -> None:
-        self.problem: Problem = build_problem(self.comm, scene, self.phases, self._mesh)
+        self.problem: Problem = build_problem(self.comm, scene, self.phases, self._mesh, self._owner)
         self.run_notes = RunNotes()
         self.notes.extend(self.problem.whole.notes)
         whole, equations = self.problem.whole, self.problem.equations
@@ -313,6 +316,27 @@ class SteppedScene:
     def in_vain(self) -> bool:
         """Whether a smaller increment of an equilibrium would not help."""
         return self.equilibrium is not None and self.equilibrium.in_vain
+
+    @property
+    def jumps(self) -> tuple[float, ...]:
+        """Times [s] of the jumps that a program makes."""
+        return self.problem.equations.start_acceleration.jumps
+
+    def expect_jump(self, time: float) -> None:
+        """Let forces, or velocities of handles, jump at a further time [s]."""
+        self.problem.equations.start_acceleration.expect_jump(time, self.time)
+        if self.guard is not None:
+            self.guard.forget_end()
+
+    def follow_driven(self, time: float) -> None:
+        """Follow what a program drives until a time [s], at which a step must end."""
+        self.control.add_event(time)
+        equations = self.problem.equations
+        if equations.integrator.handles_at_stage and self.step_number:
+            v = equations.v[: self.problem.points.n_owned].copy()
+            equations.step.prescribed.overwrite(v, equations.prescriptions.end_rates(equations.step))
+            equations.state.set_velocity(v)
+            self.energy_balance.enter_outside_change()
 
     def time_text(self) -> str:
         """Text of the present time, or load factor."""

@@ -47,9 +47,12 @@ class StartAcceleration:
         accelerations after a jump.
     starts_anew : bool
         Whether the integrator began the step from accelerations computed at its start.
+    jumps : tuple of float
+        Times [s] of the jumps that a program makes.
     """
 
     starts_anew = False
+    jumps: tuple[float, ...] = ()
 
     def __init__(
         self,
@@ -64,6 +67,10 @@ class StartAcceleration:
         self._state, self._prescriptions, self._contact = state, prescriptions, contact
         self.followers: list[NeedsAcceleration] = []
 
+    def expect_jump(self, time: float, now: float) -> None:
+        """Let forces jump at a further time [s], ``now`` or later."""
+        self.jumps = (*(jump for jump in self.jumps if jump >= now), time)
+
     def begin_step(self, step: TimeStep, x: Array) -> None:
         """Compute accelerations at the start of a step, with frozen positions x (n_local, 3), where they are
         needed; collective.
@@ -74,7 +81,7 @@ class StartAcceleration:
         integrators = self._integrators
         everyone = (integrators.present, *self.followers)
         # the start of a step may differ from the time of an event by round-off
-        if any(abs(step.start - event) <= 1e-6 * step.dt for event in self._events):
+        if any(abs(step.start - event) <= 1e-6 * step.dt for event in (*self._events, *self.jumps)):
             for follower in {integrators.usual, integrators.in_contact, *everyone}:
                 follower.restart()
         self.starts_anew = integrators.present.needs_acceleration

@@ -88,6 +88,10 @@ class StepControl:
         multiple = round(time / dt) * dt if math.isfinite(time) else math.inf
         return multiple if abs(multiple - time) <= ROUND_OFF * dt else time
 
+    def add_event(self, time: float) -> None:
+        """Let a step end at a further time [s]."""
+        bisect.insort(self._events, time)
+
     def planned_steps(self) -> int:
         """Number of steps to the end, all of the full Δt but for those cut to end at states and events."""
         every = self._every or self.end

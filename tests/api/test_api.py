@@ -61,7 +61,7 @@ def test_a_loop_over_the_steps_agrees_with_a_run(shared_tmp, comm):
         stress = simulation.gather(simulation.field("stress"), on="triangle")
         mesh, vertices = simulation.mesh, simulation.vertices
         owned = simulation.positions
-    with pytest.raises(ValueError, match="closed"):
+    with pytest.raises(lyra_petsc.InputError, match="closed"):
         simulation.step()
 
     assert [step.number for step in steps] == [1, 2, 3, 4, 5]

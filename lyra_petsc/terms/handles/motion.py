@@ -334,5 +334,7 @@ def motion_of(scene: Scene, index: int) -> Motion:
     handle = scene.handles[index]
     if handle.motion is None:
         return STILL
+    if isinstance(handle.motion, Motion):  # of a program that drives it
+        return handle.motion
     keyframes, key = scene.motions[handle.motion], f"motions.{handle.motion}"
     return Motion(keyframes, handle.interpolation, key=key, file=scene.source)
