@@ -20,6 +20,7 @@ from lyra_petsc.terms.bending.midedge_shape import (
 )
 from lyra_petsc.terms.loads.wind import Wind
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.protocols import GlobalSums
 from lyra_petsc.terms.stretch_limit import StretchLimit
 from lyra_petsc.terms.term import Assembly, Elastic, UpcomingStep, Viscous
 
@@ -70,8 +71,11 @@ def hessian(
     predicted: tuple[Array, Array] | None = None,
     n_owned: int | None = None,
 ) -> Array:
-    """What a term adds to block rows, as a dense matrix (n_owned, 3, n, 3), at positions or velocities."""
-    n = len(at)
+    """What a term adds to block rows, as a dense matrix (n_owned, 3, n, 3), at positions or velocities.
+
+    With the part that is not in block rows, unless elements have a weight.
+    """
+    n, weighted = len(at), weight is not None
     pattern = BlockPattern(term.couplings, n if n_owned is None else n_owned, n)
     values = np.zeros((pattern.n_stored, 3, 3))
     if isinstance(term, Viscous):
@@ -79,7 +83,11 @@ def hessian(
     else:
         weight = np.ones(term.n_elements) if weight is None else weight
         term.add_hessian(at, frozen, Assembly(weight, pattern.offsets, values, convexity, predicted))
-    return expanded(pattern, values, n)
+    out = expanded(pattern, values, n)
+    if isinstance(term, GlobalSums) and not weighted:
+        weights, vectors = term.dense_hessian(at, frozen)
+        out += np.einsum("k,kia,kjb->iajb", weights, vectors[:, : len(out)], vectors)
+    return out
 
 
 def element_hessians(term: Elastic, x: Array, frozen: Any, convexity: float = 0.0) -> Array:

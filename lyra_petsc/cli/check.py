@@ -24,6 +24,7 @@ from lyra_petsc.scene.schema import Contact, Friction, Scene, coefficients
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.problem import Problem
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.protocols import WritesTable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.units_check import figures
 
@@ -56,13 +57,24 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_m
             points.n_edges,
         ]
     )
-    every = comm.gather(mine, root=0)
+    every, tables = comm.gather(mine, root=0), _tables(problem)
     if every is not None:
-        _print(simulation, path, np.array(every))
+        _print(simulation, path, np.array(every), tables)
     simulation.destroy()
 
 
-def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
+def _tables(problem: Problem) -> list[tuple[str, str]]:
+    """Rows of the plan about what terms write into tables, at the start; collective."""
+    rows, here = [], problem.equations.here()
+    for term in problem.terms.values():
+        for name, *values in term.table_rows(here.x, here.frozen[term]) if isinstance(term, WritesTable) else ():
+            named = zip(term.table_columns[1:], values, term.table_units[1:], strict=True)
+            text = ", ".join(f"{column} {value:.6g} {unit}".strip() for column, value, unit in named)
+            rows.append((one_line(str(name)), text))
+    return rows
+
+
+def _print(simulation: SteppedScene, path: Path, ranks: Ints, tables: list[tuple[str, str]]) -> None:
     problem, scene, control = simulation.problem, simulation.scene, simulation.control
     whole = problem.whole
     blocks = int(ranks[:, 2].sum())
@@ -96,6 +108,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
         ("active terms", ", ".join(whole.terms)),
         ("handles", str(len(scene.handles))),
         *_contact(scene, whole.barrier.gap if whole.barrier else 0.0),
+        *tables,
         ("unknowns", f"{problem.points.n_unknowns} (velocities)"),
         (
             "nonzeros",

@@ -26,6 +26,7 @@ from petsc4py import PETSc
 from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.failed_factors import larger_margin
+from lyra_petsc.linear.low_rank import FactoredLowRank, LowRank
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.mesh.points import Layout
@@ -80,6 +81,8 @@ class Inertia:
         Force [N/m] that loads without a potential add to the product of the matrix with the rigid motions.
     doubt : float
         Stiffness [N/m] of the rigid motions below which it counts as zero.
+    dense : LowRank or None
+        A part of the matrix that is not in the block rows.
     """
 
     def __init__(
@@ -91,6 +94,7 @@ class Inertia:
         rigid: Array,
         skew: Array,
         doubt: float,
+        dense: LowRank | None = None,
     ) -> None:
         self._layout, self._values, self._rows = layout, pattern.in_blocks(values), BlockRows(pattern.whole)
         self._held, self._rigid, self._skew, self._doubt = held, rigid, skew, doubt
@@ -107,6 +111,9 @@ class Inertia:
         scale[: pattern.n_owned][self._decoupled] = 0.0
         layout.update_ghosts(scale)
         self._scale = scale
+        self._dense = dense and dense.restricted(~held[: pattern.n_owned])
+        self._scaled_dense = self._dense and self._dense.restricted(scale[: pattern.n_owned])
+        self._factored: FactoredLowRank | None = None
         # blocks are stored column by column
         self._scaled = self._values * scale[pattern.columns][:, :, None] * scale[self._row][:, None, :]
         self._scaled[self._diagonal] += self._decoupled[:, :, None] * np.eye(3) / ROUND_OFF
@@ -155,11 +162,27 @@ class Inertia:
             factors = self._factor()
             if factors.getMumpsInfog(1) >= 0:
                 self._shift = shift
-                return int(factors.getMumpsInfog(12))
+                self._factored = self._scaled_dense and self._scaled_dense.with_factors(self._solve_rows)
+                fewer = self._factored.fewer if self._factored else 0
+                return int(factors.getMumpsInfog(12)) - fewer
             margin = larger_margin(factors)
             if margin is None:
                 return None
             self._margin = margin
+
+    def _solve_rows(self, force: Array) -> Array:
+        """Solution (n_owned, 3) of the block rows that are factored."""
+        assert self._ksp is not None
+        return self._matrix.solve(self._ksp, force)
+
+    def _solve_scaled(self, force: Array) -> Array:
+        """Solution (n_owned, 3) of the whole matrix, scaled and shifted."""
+        return self._factored.solve(force) if self._factored else self._solve_rows(force)
+
+    def _scaled_product(self, u: Array) -> Array:
+        """Product (n_owned, 3) of the scaled matrix with u (n_local, 3)."""
+        product = self._rows.product(self._scaled, u)
+        return product + self._scaled_dense.product(u[: len(product)]) if self._scaled_dense else product
 
     def _factor(self) -> PETSc.Mat:
         self._free_solver()
@@ -246,6 +269,8 @@ class Inertia:
         parts = sums, symmetric, skew, others
         sizes = np.abs(sums), np.abs(symmetric), np.abs(skew), np.abs(others)
         stiffness = np.array([[form(u, v, parts, -1.0) for v in modes] for u in modes])
+        if self._dense:
+            stiffness += self._dense.forms(modes[:, : pattern.n_owned], modes[:, : pattern.n_owned])
         sizes_of_modes = np.abs(modes)
         round_off = np.array([[form(u, v, sizes, 1.0) for v in sizes_of_modes] for u in sizes_of_modes])
         # not zero for translations, whose differences vanish
@@ -266,12 +291,11 @@ class Inertia:
         modes[:, self._decoupled] = 0.0
         before = np.full(count, np.inf)
         for _ in range(MAX_SOLVES):
-            assert self._ksp is not None
-            modes = np.array([self._matrix.solve(self._ksp, mode) for mode in modes])
+            modes = np.array([self._solve_scaled(mode) for mode in modes])
             squares, vectors = np.linalg.eigh(self._dots(modes, modes))
             kept = squares > EPSILON * squares[-1]
             modes = np.tensordot((vectors[:, kept] / np.sqrt(squares[kept])).T, modes, 1)
-            products = np.array([self._rows.product(self._scaled, self._with_ghosts(u)) for u in modes])
+            products = np.array([self._scaled_product(self._with_ghosts(u)) for u in modes])
             values, vectors = np.linalg.eigh(self._dots(modes, products))
             modes = np.tensordot(vectors.T, modes, 1)
             lowest = values[:count]
@@ -315,15 +339,17 @@ class Inertia:
 
     def _supported(self, force: Array) -> Array:
         """Displacement (n_owned, 3) [m] for a force (n_owned, 3) [N] of the matrix with supports."""
-        assert self._ksp is not None
         scale = self._scale[: len(force)]
-        displacement: Array = scale * self._matrix.solve(self._ksp, scale * force)
+        displacement: Array = scale * self._solve_scaled(scale * force)
         return displacement
 
     def _product(self, u: Array) -> Array:
         """The force (n_owned, 3) on unknowns that are not prescribed, for a displacement (n_local, 3)."""
         n = self._pattern.n_owned
-        return np.where(self._held[:n], 0.0, self._rows.product(self._values, u))
+        product = self._rows.product(self._values, u)
+        if self._dense:
+            product += self._dense.product(u[:n])
+        return np.where(self._held[:n], 0.0, product)
 
     def _with_ghosts(self, owned: Array) -> Array:
         local = np.zeros((self._pattern.n_local, 3))

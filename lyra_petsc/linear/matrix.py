@@ -13,6 +13,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.linear.block_product import MAX_SCRATCH_ROWS, make_product
 from lyra_petsc.linear.block_rows import BlockRows
+from lyra_petsc.linear.low_rank import LowRank
 from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
 from lyra_petsc.linear.storage import KINDS, Storage, StoredRows
 from lyra_petsc.mesh.points import Points
@@ -56,6 +57,7 @@ class _Product:
         self._operations = 2.0 * 9.0 * pattern.n_couplings
         n_local = points.n_local if self._points is not None else 0
         self._local = np.empty((n_local, 3)) if n_local <= MAX_SCRATCH_ROWS else None
+        self.dense: LowRank | None = None
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = A x; collective."""
@@ -65,7 +67,10 @@ class _Product:
             local[: len(values)] = values
             self._points.update_ghosts(local)
             values = local
-        self._multiply(values, y.getArray().reshape(-1, 3))
+        out = y.getArray().reshape(-1, 3)
+        self._multiply(values, out)
+        if self.dense is not None:
+            out += self.dense.product(values[: len(out)])
         PETSc.Log.logFlops(self._operations)
 
     multTranspose = mult  # the matrix is symmetric
@@ -127,7 +132,8 @@ class BlockMatrix:
         self._blocks = BlockRows(pattern)
         self.rows = self._blocks.zeros() if rows is None else rows
         self.observers: list[Callable[[Array], None]] = []
-        self.mat.setPythonContext(_Product(points, pattern, self.rows, summary, entries))
+        self._product = _Product(points, pattern, self.rows, summary, entries)
+        self.mat.setPythonContext(self._product)
         _set_vec_type(self.mat)
         self.mat.setUp()
         # a matrix that PETSc frees after the end of Python must not call Python
@@ -146,6 +152,10 @@ class BlockMatrix:
             observer(self.rows)
         self.mat.assemble()
         self.mat.stateIncrease()
+
+    def add_dense(self, dense: LowRank | None) -> None:
+        """Add a matrix to products, in place of the last one, but not to ``rows``."""
+        self._product.dense = dense
 
     def destroy(self) -> None:
         """Free the matrix; collective."""

@@ -22,6 +22,7 @@ from lyra_petsc.output.layout import (
     LOCK_FILE,
     MESH_FILE,
     OBSTACLES,
+    VOLUMES,
     PROBES,
     REACTIONS,
     SCENE_FILE,
@@ -253,6 +254,11 @@ class StoredRun:
     def obstacles(self) -> Any:
         """obstacles.csv, a row for each obstacle and step [N], [N·m]; empty if the scene has no obstacles."""
         return as_frame(self._table(OBSTACLES))
+
+    @property
+    def volumes(self) -> Any:
+        """volumes.csv, a row for each closed volume and step [m³], [Pa]; empty if the scene has none."""
+        return as_frame(self._table(VOLUMES))
 
     @cached_property
     def _history(self) -> Columns:

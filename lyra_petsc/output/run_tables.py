@@ -21,6 +21,7 @@ from lyra_petsc.output.history import (
 from lyra_petsc.output.layout import HISTORY, OBSTACLES, PROBES, REACTIONS
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.terms.energies import ENERGIES
+from lyra_petsc.terms.protocols import WritesTable
 
 Row: TypeAlias = Mapping[str, float | str]
 
@@ -51,6 +52,9 @@ class RunTables:
             self.columns[REACTIONS] = (*forces, *moments)
         if scene.obstacles:
             self.columns[OBSTACLES] = OBSTACLE_COLUMNS
+        self._of_terms = [t for t in simulation.problem.terms.values() if isinstance(t, WritesTable)]
+        for term in self._of_terms:
+            self.columns[term.table] = ("step", "time", *term.table_columns)
         self._files: dict[str, History] = {}
 
     def check(self, folder: Path) -> None:
@@ -101,6 +105,14 @@ class RunTables:
             rows[OBSTACLES] = [
                 dict(zip(OBSTACLE_COLUMNS, (report.step, report.time, name, *map(float, load)), strict=True))
                 for name, load in loads
+            ]
+        here = self._simulation.problem.equations.here() if self._of_terms else None
+        for term in self._of_terms:
+            assert here is not None
+            entries = term.table_rows(here.x, here.frozen[term])
+            rows[term.table] = [
+                dict(zip(self.columns[term.table], (report.step, report.time, *entry), strict=True))
+                for entry in entries
             ]
         return rows
 

@@ -30,6 +30,7 @@ from lyra_petsc.errors import suggest
 from lyra_petsc.scene.block import BY_KIND, Block
 from lyra_petsc.scene.camera_block import Render
 from lyra_petsc.scene.fit_block import Fit
+from lyra_petsc.scene.gas_block import Gas, Liquid
 from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.petsc_block import PetscValue, petsc_options
 from lyra_petsc.scene.values import (
@@ -551,7 +552,7 @@ class Obstacle(Block):
 
 
 class AppliedLoad(VertexChoice):
-    """A force, a pressure, a traction or a moment.
+    """A force, a pressure, a traction, a moment, or what fills a closed volume.
 
     Attributes
     ----------
@@ -567,20 +568,40 @@ class AppliedLoad(VertexChoice):
     moment : float [N·m/m] or None
         Moment per rest length about the current direction of the boundary edges; a positive one lifts their
         free side towards the normal of the sheet. Needs ``midedge``.
+    gas : Gas or None
+        Gas in a closed volume; its pressure follows the volume. The block has a group of its own.
+    liquid : Liquid or None
+        Liquid that fills a closed volume.
     start, until : float [s]
-        The load acts for from ≤ t ≤ until; by default always.
+        The load acts for from ≤ t ≤ until; by default always. Not with gas and liquid.
     """
+
+    unsupported: ClassVar[dict[str, str]] = {
+        "volume": "a pressure knows no volume; in a closed volume it follows as "
+        "gas: {pressure: 200}, or liquid: {volume: 0.1}"
+    }
 
     force: Vector | None = None
     pressure: Number | None = None
     traction: Vector | None = None
     moment: Number | None = None
+    gas: Gas | None = None
+    liquid: Liquid | None = None
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
 
+    @property
+    def chamber(self) -> Gas | Liquid | None:
+        """What fills a closed volume."""
+        return self.gas or self.liquid
+
     def check(self) -> None:
         """Refuse several loads, and vertices or triangles on which a load cannot act."""
-        self.require_one("force", "pressure", "traction", "moment")
+        self.require_one("force", "pressure", "traction", "moment", "gas", "liquid")
+        for kind in self.present("gas", "liquid"):
+            for key in self.present("group", "nodes", "box"):
+                raise problem(f"belongs into the block: {kind}: {{group: …}}", key)
+            require((self.start, self.until) == (0.0, math.inf), "acts always; leave out from and until", kind)
         chosen = self.present("group", "nodes", "box")
         self.require_with("force", len(chosen) == 1, "needs exactly one of group, nodes, box to act on")
         for kind in self.present("pressure", "traction"):
@@ -840,7 +861,7 @@ class Scene(Block):
     obstacles : dict of Obstacle or None
         Rigid obstacles, by name.
     loads : list of AppliedLoad
-        Forces, pressures, tractions and moments.
+        Forces, pressures, tractions, moments and enclosed volumes.
     initial : Initial or None
         Initial velocities and noise; without this key the scene starts at rest.
     time : Time

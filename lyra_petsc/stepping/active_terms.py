@@ -11,6 +11,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.protocols import (
     Dissipates,
+    GlobalSums,
     HasDirectors,
     HasGeometry,
     LimitsStep,
@@ -59,6 +60,8 @@ class ActiveTerms:
         The terms of contact, friction alone, and the barrier alone, if there are any.
     with_edges, with_geometry : list of Elastic
         Terms with directors; those of which several methods need the same geometry.
+    summing : list of GlobalSums
+        Those that depend on sums over all ranks.
     coarse : dict of Elastic → Elastic
         The terms that replace terms with unknowns of edges on coarse levels of multigrid.
     """
@@ -83,6 +86,7 @@ class ActiveTerms:
         self.barriers = [term for term in self.of_contact if term not in self.sliding]
         self.with_edges = [term for term in self.elastic if isinstance(term, HasDirectors)]
         self.with_geometry = [term for term in self.elastic if isinstance(term, HasGeometry)]
+        self.summing = [term for term in self.elastic if isinstance(term, GlobalSums)]
         self.coarse: dict[Elastic, Elastic] = {}
 
     def add_load(self, load: Load) -> None:

@@ -209,7 +209,7 @@ class EndForces:
         equations, rise, work, springs = self._equations, 0.0, 0.0, [0.0, 0.0]
         sliding, obstacles = equations.active.sliding, equations.active.obstacles
         for term in self._targets:
-            if not term.n_elements or term in obstacles:
+            if term in obstacles:
                 continue
             # by positions at both ends, and targets at both
             table = [[float(term.energies(end.x, at.frozen[term]).sum()) for at in ends] for end in ends]

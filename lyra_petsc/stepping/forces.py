@@ -24,6 +24,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.block_rows import ConstrainedEntries, squared_norm_without
 from lyra_petsc.linear.discretisation import Discretisation
+from lyra_petsc.linear.low_rank import LowRank
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.active_terms import ActiveTerms, Frozen, gradient
 from lyra_petsc.stepping.damping import Damping
@@ -162,7 +163,7 @@ class StageForces:
             else:
                 stiffness = term.force_scale(1.0)[: term.n_owned]
             # `**` would raise an error where the square is infinite
-            square += 2.0 * float(np.vdot(energies, stiffness * (of_size * of_size)))
+            square += 2.0 * abs(float(np.vdot(energies, stiffness * (of_size * of_size))))
         parts.append(-rate * float(np.vdot(step.loads.force, at.x[:n] - step.x[:n])))
         if step.loads.following is not None:
             parts.append(rate * step.loads.following.energy(at.x))
@@ -208,10 +209,19 @@ class StageForces:
                 wind.add_hessian(at.v, at.frozen[wind], rows.pattern.offsets, values)
         if step.loads.following is not None and convexity < 1.0:
             step.loads.following.add_hessian((1.0 - convexity) * reach, rows.pattern, values)
-        force = self._force_of_prescribed(step.prescribed, values) if step.linear else None
+        force = self._force_of_prescribed(at, values) if step.linear else None
         if len(changing):
             rows.constrain(values, step.prescribed.mask, constrained)
         return force
+
+    def dense_part(self, at: Evaluation) -> LowRank | None:
+        """The part of the Jacobian that is not in block rows, prescribed unknowns not decoupled; collective."""
+        terms = self.active.summing
+        if not terms:
+            return None
+        weights, vectors = zip(*(term.dense_hessian(at.x, at.frozen[term]) for term in terms), strict=True)
+        owned = np.concatenate(vectors)[:, : len(self.mass)]
+        return LowRank(self.layout, at.step.stage.c * np.concatenate(weights), owned)
 
     def constrained(self, prescribed: PrescribedUnknowns) -> ConstrainedEntries:
         """Entries of the present matrix in rows and columns of prescribed unknowns."""
@@ -224,13 +234,16 @@ class StageForces:
         """The matrix has other entries."""
         self._constrained = None
 
-    def _force_of_prescribed(self, prescribed: PrescribedUnknowns, values: Array) -> Array | None:
+    def _force_of_prescribed(self, at: Evaluation, values: Array) -> Array | None:
         """The product (n_owned, 3) [N] of the Jacobian ``values``, before prescribed unknowns are decoupled,
         with the velocities of these; 0 in their rows. None if none moves; collective.
         """
+        prescribed = at.step.prescribed
         increment = np.zeros((len(self.mass), 3))
         prescribed.overwrite(increment, prescribed.velocity)
         if not any(self.layout.global_max(bool(increment.any()))):
             return None
         product = self._discretisation.rows.product(values, self.layout.extended(increment))
+        if (dense := self.dense_part(at)) is not None:
+            product += dense.product(increment)
         return np.where(prescribed.free, product, 0.0)

@@ -146,10 +146,12 @@ class Evaluation:
 
     @cached_property
     def frozen(self) -> Mapping[Term, Any]:
-        """Data of each term that are constant in the step, with its geometry or active pairs here."""
+        """Data of each term that are constant in the step, with its geometry, active pairs or sums here;
+        collective.
+        """
         active, frozen = self.forces.active, self.step.frozen
-        pairs = {term: term.at(self.x, frozen[term]) for term in active.barriers}
-        return active.refreeze(frozen, {**self.geometry, **pairs})
+        here = {term: term.at(self.x, frozen[term]) for term in (*active.barriers, *active.summing)}
+        return active.refreeze(frozen, {**self.geometry, **here})
 
     @cached_property
     def internal(self) -> Array:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -160,14 +160,57 @@ class FollowsHandles(Elastic):
         """Local rows (n,) for which ``freeze`` calls `UpcomingStep.reference`."""
 
 
-class MovingTargets(FollowsHandles):
-    """An energy stored in the sheet on which targets do work as they move."""
+class MovingTargets(Elastic):
+    """An energy stored in the sheet on which numbers that change in time do work: positions of targets, or an
+    amount of gas.
+    """
 
     @abstractmethod
     def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:
-        """Positions [m] of the targets of the owned elements, and the energy's gradient by them [N], (n, 3)
-        each.
+        """These numbers, such as positions [m] of the targets of the owned elements, and this rank's part of
+        the energy's gradient by them, such as forces [N], of the same shape.
         """
+
+
+class GlobalSums(Elastic):
+    """An energy that depends on sums over the elements of all ranks, such as an enclosed volume.
+
+    Its Hessian is the sum of block rows and of w g gᵀ for each sum, with its gradient g, which is applied to
+    vectors and never assembled. Without the sums at positions x, in ``frozen`` data that `at` returns,
+    methods compute them, and are collective.
+    """
+
+    over_ranks: Callable[[Array], Array] = staticmethod(np.array)  # type: ignore[assignment]
+    """Returns sums over ranks of an array's numbers; collective."""
+
+    def set_communication(self, over_ranks: Callable[[Array], Array]) -> None:
+        """Set `over_ranks`, before other methods are called; collective."""
+        self.over_ranks = over_ranks  # type: ignore[method-assign]
+
+    @abstractmethod
+    def at(self, x: Array, frozen: Any) -> Any:
+        """The frozen data with the sums at positions x (n_local, 3); unchanged if they have them."""
+
+    @abstractmethod
+    def dense_hessian(self, x: Array, frozen: Any) -> tuple[Array, Array]:
+        """Weights w (k,), not negative, and vectors g (k, n_local, 3), right in owned rows."""
+
+
+class WritesTable(Elastic):
+    """A term with a table of its own in the folder of a run, whose first columns are step and time."""
+
+    table: ClassVar[str]
+    """Name of the file."""
+
+    table_columns: ClassVar[tuple[str, ...]]
+    """Columns after the first two; the first of these is a name."""
+
+    table_units: ClassVar[tuple[str, ...]]
+    """Their units, as ``check`` prints them with the values at the start; none for numbers without."""
+
+    @abstractmethod
+    def table_rows(self, x: Array, frozen: Any) -> list[tuple[float | str, ...]]:
+        """Rows at positions x (n_local, 3), the same on all ranks; collective."""
 
 
 class PullsHandles(FollowsHandles):

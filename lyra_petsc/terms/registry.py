@@ -178,6 +178,12 @@ REGISTRY: list[Registration] = [
         module_name=".bending.hinge_clamp",
     ),
     Registration(
+        "chambers",
+        lambda scene, shells: any(load.chamber for load in scene.loads),
+        Role.ELASTIC,
+        "gas_energy",
+    ),
+    Registration(
         "spring",
         lambda scene, shells: any(h.stiffness is not None or h.fade > 0 for h in scene.handles),
         Role.EXTERNAL,

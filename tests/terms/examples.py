@@ -23,6 +23,13 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
     "shear_friction": {"material": BENDING | {"friction_force": 2.0}},
     "clamp": {"handles": [{"nodes": [0, 1, 2, 3], "clamp": True}]},
     "spring": {"handles": [{"nodes": [1, 5, 9], "stiffness": 300.0}, {"nodes": [9, 10], "stiffness": 50.0}]},
+    "chambers": {
+        "loads": [
+            {"gas": {"group": ["roof", "wall"], "pressure": 900.0, "ambient": 3000.0}},
+            {"gas": {"group": ["floor", "wall"], "pressure": -40.0, "exponent": 1.0, "amount": 1.3}},
+            {"liquid": {"group": ["roof", "floor"], "name": "both", "volume": 0.3}},
+        ],
+    },
     "gravity": {"gravity": [0.3, -1.0, -9.0]},
     "wind": {"wind": {"velocity": [1.0, 2.0, -3.0], "density": 1.2, "drag": 0.4}},
     "pressure": {"loads": [{"pressure": 7.0}]},
@@ -32,6 +39,9 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
         "loads": [{"group": "sheet", "moment": 2.0}],
     },
 }
+
+CLOSED = {"chambers"}
+"""Terms on two tetrahedra with a common wall instead of the curved sheet."""
 
 NX, NY = 3, 2
 
@@ -53,10 +63,23 @@ def curved_sheet(path: Path) -> dict[str, Any]:
     return obj_file(path, vertices, triangles)
 
 
+def two_tetrahedra(path: Path) -> dict[str, Any]:
+    """Two tetrahedra with a common wall, in groups; some normals point inwards."""
+    vertices = [(0.0, 0.0, 0.0), (1.0, 0.1, 0.0), (0.2, 0.9, 0.1), (0.3, 0.4, 0.8), (0.4, 0.2, -0.9)]
+    corners = [(1, 2, 4), (2, 3, 4), (3, 1, 4), (1, 2, 5), (3, 2, 5), (3, 1, 5), (1, 2, 3)]
+    groups = ["roof"] * 3 + ["floor"] * 3 + ["wall"]
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+    for group, triangle in zip(groups, corners, strict=True):
+        lines += [f"g {group}", "f " + " ".join(map(str, triangle))]
+    path.write_text("\n".join(lines) + "\n")
+    return {"file": str(path)}
+
+
 def example(name: str, folder: Path) -> Simulation:
     """The curved sheet with the term ``name`` active, on this process alone."""
+    mesh = two_tetrahedra if name in CLOSED else curved_sheet
     content = {
-        "mesh": curved_sheet(folder / "sheet.obj") | {"name": "sheet"},
-        "material": BENDING,
+        "mesh": mesh(folder / "sheet.obj") | {"name": "sheet"},
+        "material": BENDING | ({"bending_model": "midedge"} if name in CLOSED else {}),
     } | FRAGMENTS[name]
     return Simulation(content, MPI.COMM_SELF)

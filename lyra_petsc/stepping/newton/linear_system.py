@@ -12,6 +12,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.errors import InputError
 from lyra_petsc.linear import multigrid, presets
 from lyra_petsc.linear.hierarchy import Hierarchy, InterpolationRows, Surface, interpolations
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix, Matrix
@@ -177,6 +178,12 @@ class LinearSystem:
         self._regularised = iterates and hessian != "regularised" and not direct and not self._one_matrix
         self._shifts = not direct
         self.factors = PETSc.Options().getString("pc_type", "") in ("cholesky", "lu")
+        if equations.active.summing and (direct or self._one_matrix):
+            raise InputError(
+                "needs all entries of the matrix, but those of an enclosed volume are only in its products; take "
+                "-ksp_type cg -pc_type cholesky",
+                key="-ksp_type" if direct else "-pc_type",
+            )
         self.cycles = multigrid.is_requested()
         # multigrid set up for earlier positions takes many more iterations
         asked = is_set("snes_lag_preconditioner")
@@ -197,7 +204,8 @@ class LinearSystem:
         kind = presets.matrix_type(self._preset)
         self.operator: Matrix
         self.preconditioner: Matrix
-        if is_set("mat_type") or self._one_matrix:
+        dense = bool(self._equations.active.summing)  # which only products apply
+        if (is_set("mat_type") and not dense) or self._one_matrix:
             self.operator = AssembledMatrix(layout, pattern, kind)
         else:
             self.operator = BlockMatrix(layout, pattern, self._block_summary)
@@ -322,6 +330,9 @@ class LinearSystem:
     def assemble_operator(self, at: Evaluation, convexity: float) -> Array | None:
         """Assemble the Jacobian at the `linearised` stage with this weight of the regularised Hessian."""
         force = self._jacobian(at, convexity, self.operator.rows)
+        if isinstance(self.operator, BlockMatrix):
+            dense = self._equations.forces.dense_part(at)
+            self.operator.add_dense(dense and dense.restricted(at.step.prescribed.free))
         self.operator.set(self.operator.rows)
         return force
 

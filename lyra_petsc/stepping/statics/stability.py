@@ -7,7 +7,7 @@ those of the Schur complement on the vertices.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -138,7 +138,10 @@ class Examination:
         # forces f at vertices turned by an angle θ do the work ½ θ² f · x, at most
         doubt = force * float(np.sqrt(points.n_vertices_global)) / size
         skew = np.array([np.where(held[:n], 0.0, -loads.skew_force(motion, n)) for motion in rigid])
-        return Inertia(points, equations.discretisation.rows.pattern, values, held, rigid, skew, doubt)
+        pattern, dense = equations.discretisation.rows.pattern, equations.forces.dense_part(equations.here())
+        if dense is not None:
+            dense = replace(dense, weights=dense.weights / equations.step.stage.c)
+        return Inertia(points, pattern, values, held, rigid, skew, doubt, dense)
 
     @cached_property
     def stability(self) -> Stability:

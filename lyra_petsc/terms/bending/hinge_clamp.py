@@ -28,7 +28,7 @@ from lyra_petsc.terms.bending.dihedral_angle import angle
 from lyra_petsc.terms.bending.hinge import edge_in_material, mirrored_angles
 from lyra_petsc.terms.bending.hinge_energy import fading_limit, hinge_energy, hinge_gradient, hinge_hessian
 from lyra_petsc.terms.handles.motion import Motion, Window, motion_of
-from lyra_petsc.terms.protocols import MovingTargets
+from lyra_petsc.terms.protocols import FollowsHandles, MovingTargets
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import UpcomingStep
 
@@ -107,7 +107,7 @@ def _mirrored(tail: Array, head: Array, opposite: Array) -> Array:
     return 2.0 * (tail + along[:, None] * edge) - opposite
 
 
-class Clamp(MovingTargets):
+class Clamp(FollowsHandles, MovingTargets):
     """Half hinges of all clamped handles.
 
     Parameters
