@@ -67,7 +67,9 @@ def _tables(problem: Problem) -> list[tuple[str, str]]:
     """Rows of the plan about what terms write into tables, at the start; collective."""
     rows, here = [], problem.equations.here()
     for term in problem.terms.values():
-        for name, *values in term.table_rows(here.x, here.frozen[term]) if isinstance(term, WritesTable) else ():
+        if not isinstance(term, WritesTable):
+            continue
+        for name, *values in term.table_rows(here.x, here.frozen[term]):
             named = zip(term.table_columns[1:], values, term.table_units[1:], strict=True)
             text = ", ".join(f"{column} {value:.6g} {unit}".strip() for column, value, unit in named)
             rows.append((one_line(str(name)), text))

@@ -162,9 +162,11 @@ class Inertia:
             factors = self._factor()
             if factors.getMumpsInfog(1) >= 0:
                 self._shift = shift
-                self._factored = self._scaled_dense and self._scaled_dense.with_factors(self._solve_rows)
-                fewer = self._factored.fewer if self._factored else 0
-                return int(factors.getMumpsInfog(12)) - fewer
+                negative = int(factors.getMumpsInfog(12))
+                if self._scaled_dense is not None:
+                    self._factored = self._scaled_dense.with_factors(self._solve_rows)
+                    negative -= self._factored.fewer
+                return negative
             margin = larger_margin(factors)
             if margin is None:
                 return None

@@ -1,8 +1,8 @@
 """Symmetric matrices G W Gᵀ of a few vectors, added to a sparse matrix A without being assembled.
 
 With A factored, A + G W Gᵀ, W > 0, has the inverse A⁻¹ − A⁻¹ G S⁻¹ Gᵀ A⁻¹ with S = W⁻¹ + Gᵀ A⁻¹ G
-(Sherman, Morrison & Woodbury), and as many negative eigenvalues as A less those of S: both are Schur complements
-in the matrix [[A, G], [Gᵀ, −W⁻¹]].
+(Sherman, Morrison & Woodbury), and as many negative eigenvalues as A has more than S: both are Schur
+complements in the matrix [[A, G], [Gᵀ, −W⁻¹]].
 
 Source: Haynsworth, Determination of the inertia of a partitioned Hermitian matrix, Linear Algebra Appl. 1
 (1968) 73-81.
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.mesh.points import Points
 
 
@@ -45,8 +45,8 @@ class LowRank:
         u, v = (np.array([self._dots(x) for x in xs]).reshape(len(xs), -1) for xs in (one, other))
         return np.asarray((u * self.weights) @ v.T)
 
-    def restricted(self, scale: Array) -> LowRank:
-        """The same with rows and columns multiplied by ``scale`` (n_owned, 3), or left out where it is False."""
+    def restricted(self, scale: Array | Mask) -> LowRank:
+        """The same with rows and columns multiplied by ``scale`` (n_owned, 3), or left out if it is False."""
         return LowRank(self.points, self.weights, self.vectors * scale)
 
     def _dots(self, x: Array) -> Array:
@@ -78,4 +78,6 @@ class FactoredLowRank:
     def solve(self, b: Array) -> Array:
         """The solution (n_owned, 3) for the right side b (n_owned, 3)."""
         x = self._solve(b)
-        return np.asarray(x - np.tensordot(np.linalg.solve(self._inner, self._low_rank._dots(x)), self._solved, 1))
+        return np.asarray(
+            x - np.tensordot(np.linalg.solve(self._inner, self._low_rank._dots(x)), self._solved, 1)
+        )

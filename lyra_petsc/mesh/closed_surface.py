@@ -36,7 +36,8 @@ def holes(points: Array, triangles: Ints) -> list[Hole]:
     lengths = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
     curves = [curve == number for number in np.unique(curve)]
     listed = [
-        Hole(points[ends[mine, 0]].mean(axis=0), float(lengths[mine].sum()), int(mine.sum())) for mine in curves
+        Hole(points[ends[mine, 0]].mean(axis=0), float(lengths[mine].sum()), int(mine.sum()))
+        for mine in curves
     ]
     return sorted(listed, key=lambda hole: -hole.length)
 
@@ -48,8 +49,8 @@ def branches(triangles: Ints) -> Ints:
 
 
 def outward(points: Array, triangles: Ints) -> tuple[Ints, int]:
-    """The triangles (F, 3) of a closed surface, its normals outwards, and the number of those that were turned;
-    -1 if they have no common orientation, as on a Klein bottle.
+    """The triangles (F, 3) of a closed surface, its normals outwards, and the number of those that were
+    turned; -1 if they have no common orientation, as on a Klein bottle.
 
     Each of its pieces encloses a positive volume.
     """
@@ -66,7 +67,9 @@ def outward(points: Array, triangles: Ints) -> tuple[Ints, int]:
     component = connected_components(2 * n, links)
     if (component[:n] == component[n:]).any():
         return triangles, -1
-    turned = component[:n] > component[n:]  # of the two components of a piece the lower has its first triangle
+    turned = (
+        component[:n] > component[n:]
+    )  # of the two components of a piece the lower has its first triangle
     piece = np.unique(np.minimum(component[:n], component[n:]), return_inverse=True)[1]
     corners = points[triangles] - points[triangles].mean(axis=(0, 1))
     sixth = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0

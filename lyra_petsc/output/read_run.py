@@ -22,11 +22,11 @@ from lyra_petsc.output.layout import (
     LOCK_FILE,
     MESH_FILE,
     OBSTACLES,
-    VOLUMES,
     PROBES,
     REACTIONS,
     SCENE_FILE,
     SUMMARY_FILE,
+    VOLUMES,
 )
 from lyra_petsc.output.run_folder import is_locked
 from lyra_petsc.output.stored import StoredMesh, check_file, check_folder, read_stored, states_in

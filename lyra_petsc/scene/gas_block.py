@@ -4,14 +4,27 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BeforeValidator
+from pydantic import AfterValidator, BeforeValidator
 
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.values import NonNegative, Number, Positive, Text, require
+from lyra_petsc.scene.time_curve import NumberInTime, NumberPoints, plain_values
+from lyra_petsc.scene.values import Number, Positive, Text, require
 
 
 def _one_or_many(value: Any) -> Any:
     return tuple(value) if isinstance(value, (list, tuple)) else (value,)
+
+
+def _positive(value: float | NumberPoints) -> float | NumberPoints:
+    for amount in plain_values(value):
+        require(amount > 0.0, f"must be > 0, not {amount:g}")
+    return value
+
+
+def _volume(value: float | NumberPoints) -> float | NumberPoints:
+    amounts = [float(amount) for amount in plain_values(value)]
+    require(min(amounts) >= 0.0 and max(amounts) > 0.0, "must be > 0, in a curve >= 0")
+    return value
 
 
 class Chamber(Block):
@@ -51,8 +64,10 @@ class Gas(Chamber):
         1.4 for fast changes of air (adiabatic), 1 for slow ones (isothermal).
     ambient : float [Pa]
         Absolute pressure outside.
-    amount : float
-        Amount of gas, relative to that of ``pressure`` in V0.
+    amount : float or curve
+        Amount of gas, relative to that of ``pressure`` in V0. In a static analysis the load factor replaces
+        the time of a curve; if there is none, gas is let in as the load factor grows, such that the gauge
+        pressure in V0 would grow in proportion to it.
     """
 
     unsupported: ClassVar[dict[str, str]] = {
@@ -62,9 +77,9 @@ class Gas(Chamber):
     }
 
     pressure: Number
-    exponent: NonNegative = 1.4
+    exponent: Positive = 1.4
     ambient: Positive = 101325.0
-    amount: Positive = 1.0
+    amount: Annotated[NumberInTime, AfterValidator(_positive)] = 1.0
 
     def check(self) -> None:
         """Refuse less than a vacuum."""
@@ -77,12 +92,18 @@ class Liquid(Chamber):
 
     Attributes
     ----------
-    volume : float [m³] or None
-        Its volume without pressure; by default that of the surface at the start.
+    volume : float or curve [m³] or None
+        Its volume without pressure; by default that of the surface at the start. In a static analysis the
+        load factor replaces the time of a curve, and a number is reached in proportion to it.
     """
 
     unsupported: ClassVar[dict[str, str]] = {
         "pressure": "follows from the volume; gas: {pressure: 200} is given by its pressure at the start"
     }
 
-    volume: Positive | None = None
+    volume: Annotated[NumberInTime, AfterValidator(_volume)] | None = None
+
+    @property
+    def amount(self) -> float | NumberPoints | None:
+        """The volume."""
+        return self.volume

@@ -601,7 +601,9 @@ class AppliedLoad(VertexChoice):
         for kind in self.present("gas", "liquid"):
             for key in self.present("group", "nodes", "box"):
                 raise problem(f"belongs into the block: {kind}: {{group: …}}", key)
-            require((self.start, self.until) == (0.0, math.inf), "acts always; leave out from and until", kind)
+            require(
+                (self.start, self.until) == (0.0, math.inf), "acts always; leave out from and until", kind
+            )
         chosen = self.present("group", "nodes", "box")
         self.require_with("force", len(chosen) == 1, "needs exactly one of group, nodes, box to act on")
         for kind in self.present("pressure", "traction"):

@@ -96,11 +96,14 @@ class StageForces:
             yield self._with_square(step, "damping", at.damping)
         if active.viscous and not step.lagged:
             yield self._with_square(step, "wind", self.sum(active.viscous, at.v, at.frozen))
+        if active.summing:  # such as a pressure that the sheet's own forces balance
+            yield self._with_square(step, "filling", self.sum(active.summing, at.x, at.frozen))
         yield self._with_square(step, "internal", at.internal)
 
     def internal(self, at: Evaluation) -> Array:
-        """Forces (n_owned, 3) [N] of the sheet."""
-        return self.sum(self.active.sheet, at.x, at.frozen)
+        """Forces (n_owned, 3) [N] of the sheet, without what fills it."""
+        own = [term for term in self.active.sheet if term not in self.active.summing]
+        return self.sum(own, at.x, at.frozen)
 
     def damping(self, at: Evaluation) -> Array:
         """Forces (n_owned, 3) [N] of material damping."""
@@ -215,7 +218,7 @@ class StageForces:
         return force
 
     def dense_part(self, at: Evaluation) -> LowRank | None:
-        """The part of the Jacobian that is not in block rows, prescribed unknowns not decoupled; collective."""
+        """The part of the Jacobian that is not in block rows, with prescribed unknowns; collective."""
         terms = self.active.summing
         if not terms:
             return None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
+from lyra_petsc.linear.low_rank import LowRank
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
@@ -64,8 +65,9 @@ class PerturbedScene:
         Factor of this scene's quantities in a derivative.
     problem : Problem
     energy_balance : EnergyBalance or None
-    jacobian, prescribed_force : array or None
-        Block rows [kg/s] and force (n_owned, 3) [N] by which a semi-implicit step is linear.
+    jacobian, dense, prescribed_force : array, LowRank or None
+        Block rows [kg/s], what else the matrix has, and force (n_owned, 3) [N] by which a semi-implicit step
+        is linear.
     edges : EdgeSolve or None
     """
 
@@ -74,6 +76,7 @@ class PerturbedScene:
     problem: Problem
     energy_balance: EnergyBalance | None = None
     jacobian: Array | None = None
+    dense: LowRank | None = None
     prescribed_force: Array | None = None
     edges: EdgeSolve | None = None
 
@@ -139,7 +142,8 @@ class PerturbedScene:
         if self.prescribed_force is not None:
             out += self.prescribed_force
         local = equations.points.extended(v - start)
-        return out + equations.discretisation.rows.product(self.jacobian, local)
+        out += equations.discretisation.rows.product(self.jacobian, local)
+        return out if self.dense is None else out + self.dense.product(v - start)
 
 
 class Tangent:

@@ -254,6 +254,8 @@ class Sensitivities:
             scene.jacobian = equations.discretisation.rows.zeros()
             at = equations.linearised(start)
             scene.prescribed_force = equations.forces.jacobian(at, 1.0, scene.jacobian)
+            dense = equations.forces.dense_part(at)
+            scene.dense = dense and dense.restricted(equations.step.prescribed.free)
 
     def _solve_stages(
         self, solve: Callable[[Array], Array], tangent: Tangent, velocity: Array

@@ -1,16 +1,18 @@
-"""Gas or liquid in closed volumes V: the energy ∫ p dV from V to V0, with the gauge pressure p.
+"""Gas or liquid in closed volumes V: the energy ∫ p dV from V to the volume Va without gauge pressure p.
 
-Gas: p + ambient = P = a^γ P0 (V0/V)^γ, with the exponent γ, the amount a, and P0 and V0 of the start, and
+Gas: p + ambient = a^γ P0 (V0/V)^γ, with the exponent γ, the amount a, and P0 and V0 of the start, and
 
-    U = a^γ P0 V0 L φ((γ − 1) L) + ambient (V − V0),  L = ln(V0/V),  φ(z) = (eᶻ − 1)/z,  φ(0) = 1
+    U = ambient (Va L φ((γ − 1) L) + V − Va),  L = ln(Va/V),  φ(z) = (eᶻ − 1)/z,  φ(0) = 1
 
-Liquid of volume Vl and bulk modulus K: U = ½ K (V − Vl)²/Vl.
+with Va = a V0 (P0/ambient)^(1/γ). It is the least work that fills the chamber from outside.
+
+Liquid of volume Vl and bulk modulus K: U = ½ K (V − Vl)²/Vr, with the largest Vl as Vr.
 
 The gradient is −p ∂V/∂x: the pressure acts along the current normals. The Hessian is −p ∂²V/∂x², the sum of
 symmetric blocks of the triangles, plus −p′(V) g gᵀ with g = ∂V/∂x, of all vertices of a chamber with all.
 
-V = ⅙ Σ xₐ · (x_b × x_c) over the triangles, which are oriented outwards. For a closed surface it is the volume
-wherever the origin is.
+V = ⅙ Σ xₐ · (x_b × x_c) over the triangles, which are oriented outwards. As the surface is closed, it does
+not depend on the origin.
 """
 
 from __future__ import annotations
@@ -22,15 +24,16 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
-from lyra_petsc.kernels.element import kernel
-from lyra_petsc.kernels.vector3 import cross, dot, point
+from lyra_petsc.kernels.element import inlined, kernel
+from lyra_petsc.kernels.vector3 import cross, dot, minus, point
 from lyra_petsc.mesh.closed_surface import branches, holes, outward
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_triangles
 from lyra_petsc.mesh.topology import enclosed_volumes
-from lyra_petsc.scene.gas_block import Chamber, Gas
+from lyra_petsc.scene.gas_block import Chamber, Gas, Liquid
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.time_curve import TimeCurve, is_curve
 from lyra_petsc.terms.protocols import GlobalSums, MovingTargets, WritesTable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import UpcomingStep
@@ -46,42 +49,57 @@ COLLAPSED = 1e-12
 
 
 class Filling(NamedTuple):
-    """Frozen data: the amounts of what fills the chambers, and, at positions, the volumes.
+    """Frozen data: the amounts of what fills the chambers, their middles, and, at positions, the volumes.
 
     Attributes
     ----------
     amount : (k,)
         Relative amount of gas, or volume [m³] of liquid.
+    origin : (k, 3)
+        Points [m] inside, relative to which coordinates are small.
     volume : (k,) or None
         Volume [m³] of each chamber.
     """
 
     amount: Array
+    origin: Array
     volume: Array | None = None
 
 
+@inlined()
+def corner(x, s, e, k, origin, n):  # type: ignore[no-untyped-def]
+    """Corner k of triangle e of s (E, 3), relative to the n-th origin."""
+    return minus(point(x, s[e, k % 3]), point(origin, n))
+
+
 @kernel()
-def add_volumes(x, s, n, chamber, out):  # type: ignore[no-untyped-def]
+def add_volumes(x, s, n, chamber, origin, out):  # type: ignore[no-untyped-def]
     """Add the volumes [m³] below the first n of triangles s (E, 3) to those of their chambers, out (k,)."""
     for e in range(n):
-        a, b, c = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2])
-        out[chamber[e]] += dot(a, cross(b, c)) / 6.0
+        m = chamber[e]
+        a, b, c = (
+            corner(x, s, e, 0, origin, m),
+            corner(x, s, e, 1, origin, m),
+            corner(x, s, e, 2, origin, m),
+        )
+        out[m] += dot(a, cross(b, c)) / 6.0
 
 
 @kernel()
-def add_gradient(x, s, chamber, weight, out):  # type: ignore[no-untyped-def]
+def add_gradient(x, s, chamber, origin, weight, out):  # type: ignore[no-untyped-def]
     """Add the gradient of each volume times ``weight`` (k,) to out (n_local, 3)."""
     for e in range(s.shape[0]):
         factor = weight[chamber[e]] / 6.0
         for k in range(3):
-            normal = cross(point(x, s[e, (k + 1) % 3]), point(x, s[e, (k + 2) % 3]))
+            m = chamber[e]
+            normal = cross(corner(x, s, e, k + 1, origin, m), corner(x, s, e, k + 2, origin, m))
             i = s[e, k]
             for axis in range(3):
                 out[i, axis] += factor * normal[axis]
 
 
 @kernel()
-def hessians(x, s, chamber, weight, out):  # type: ignore[no-untyped-def]
+def hessians(x, s, chamber, origin, weight, out):  # type: ignore[no-untyped-def]
     """Write the Hessians of the triangles' volumes times ``weight`` (k,) to out (E, 3, 3, 3, 3)."""
     out[:] = 0.0
     for e in range(s.shape[0]):
@@ -89,7 +107,7 @@ def hessians(x, s, chamber, weight, out):  # type: ignore[no-untyped-def]
         for k in range(3):
             # ∂/∂x_b (x_b × x_c): corners k and k + 1 by the third
             i, j = k, (k + 1) % 3
-            c = point(x, s[e, (k + 2) % 3])
+            c = corner(x, s, e, k + 2, origin, chamber[e])
             block = out[e, i, j]
             block[0, 1], block[0, 2] = factor * c[2], -factor * c[1]
             block[1, 0], block[1, 2] = -factor * c[2], factor * c[0]
@@ -107,17 +125,19 @@ class Chambers(GlobalSums, MovingTargets, WritesTable):
     elements : Elements
         Stencil (E, 3), oriented outwards; data ``chamber`` (E,) its number; ``volume`` (E,) [m³] and ``area``
         (E,) [m²] of the chamber at the start, and ``share`` (E,), the inverse number of its triangles.
-    fillings : sequence of Chamber
+    fillings : list of Gas or Liquid
         The blocks of the scene.
+    static : bool
+        Whether a static analysis lets them in.
     """
 
     table = "volumes.csv"
     table_columns = ("name", "volume", "pressure", "amount")
     table_units = ("", "m³", "Pa", "")
 
-    def __init__(self, elements: Elements, fillings: list[Chamber]) -> None:
+    def __init__(self, elements: Elements, fillings: list[Gas | Liquid], *, static: bool) -> None:
         super().__init__(elements)
-        self._fillings = fillings
+        self._fillings, self._static = fillings, static
         self._chamber = elements.data["chamber"].astype(np.int64)
         self._share = elements.data["share"]
         self._is_gas = np.array([isinstance(filling, Gas) for filling in fillings])
@@ -135,27 +155,42 @@ class Chambers(GlobalSums, MovingTargets, WritesTable):
         """Set the volumes at the start, which ranks without elements of a chamber do not know."""
         share = (self._share * self.elements.data["volume"])[: self.n_owned]
         self._volume = self.over_ranks(self._by_chamber(share))
+        with np.errstate(all="ignore"):  # of liquid
+            self._relaxed = self._volume * (self._start / self._ambient) ** (1.0 / self._exponent)
+        given = [filling.amount for filling in self._fillings]
+        curves = [TimeCurve.of(v if a is None else a) for a, v in zip(given, self._volume, strict=True)]
+        self._curves = curves
+        self._largest = np.array([max(float(curve.largest), 1e-300) for curve in curves])
 
     def _by_chamber(self, values: Array) -> Array:
         """Sums (k,) over this rank's owned elements of each chamber."""
-        return np.bincount(self._chamber[: self.n_owned], values, len(self._fillings))
+        return np.asarray(
+            np.bincount(self._chamber[: self.n_owned], values, len(self._fillings)), dtype=np.float64
+        )
 
     def freeze(self, step: UpcomingStep) -> Filling:
-        return Filling(self._amounts(step.target_time))
+        count = len(self._fillings)
+        corners = step.x[self.stencil[: self.n_owned, 0]] * self._share[: self.n_owned, None]
+        middles = np.stack([self._by_chamber(coordinates) for coordinates in corners.T], axis=1)
+        origin = self.over_ranks(middles.ravel()).reshape(count, 3)
+        return Filling(self._amounts(step.target_time), origin)
 
     def _amounts(self, time: float) -> Array:
         """Amounts (k,) at a time [s]."""
-        own = [
-            filling.amount if isinstance(filling, Gas) else filling.volume or start
-            for filling, start in zip(self._fillings, self._volume, strict=True)
-        ]
-        return np.array(own, dtype=np.float64)
+        amounts = np.array([curve.at(time) for curve in self._curves])
+        grows = np.array([self._static and not is_curve(filling.amount) for filling in self._fillings])
+        with np.errstate(all="ignore"):  # of liquid
+            end = self._start * amounts**self._exponent
+            part = (self._ambient + time * (end - self._ambient)) / self._start
+            gas = part ** (1.0 / self._exponent)
+        liquid = self._volume + time * (amounts - self._volume)
+        return np.where(grows, np.where(self._is_gas, gas, liquid), amounts)
 
     def at(self, x: Array, frozen: Filling) -> Filling:
         if frozen.volume is not None:
             return frozen
         volume = np.zeros(len(self._fillings))
-        add_volumes(x, self.stencil, self.n_owned, self._chamber, volume)
+        add_volumes(x, self.stencil, self.n_owned, self._chamber, frozen.origin, volume)
         return frozen._replace(volume=self.over_ranks(volume))
 
     def _state(self, x: Array, frozen: Filling) -> tuple[Array, Array]:
@@ -165,19 +200,22 @@ class Chambers(GlobalSums, MovingTargets, WritesTable):
         above = np.maximum(volume, COLLAPSED * self._volume)
         with np.errstate(all="ignore"):
             gas = self._start * (frozen.amount * self._volume / above) ** self._exponent
-        liquid = BULK_MODULUS * (1.0 - volume / frozen.amount)
+        liquid = BULK_MODULUS / self._largest * (frozen.amount - volume)
         return volume, np.where(self._is_gas, gas, liquid)
 
     def _energies(self, volume: Array, amount: Array) -> Array:
         """Energy (k,) [J] of each chamber."""
-        with np.errstate(all="ignore"):
-            fall = -np.log1p((volume - self._volume) / self._volume)
-            gas = self._start * self._volume * amount**self._exponent * fall
-            gas *= _mean_growth((self._exponent - 1.0) * fall)
-        gas += self._ambient * (volume - self._volume)
-        gas = np.where(volume > 0.0, gas, np.inf)
-        liquid = 0.5 * BULK_MODULUS * (volume - amount) ** 2 / amount
+        gas = np.where(volume > 0.0, sum(self._works(volume, amount)), np.inf)
+        liquid = 0.5 * BULK_MODULUS / self._largest * (volume - amount) ** 2
         return np.where(self._is_gas, gas, liquid)
+
+    def _works(self, volume: Array, amount: Array) -> tuple[Array, Array]:
+        """Work (k,) [J] of gases as they expand from these volumes to ambient pressure, and against it."""
+        with np.errstate(all="ignore"):
+            relaxed = amount * self._relaxed
+            rise = -np.log1p((volume - relaxed) / relaxed)
+            work = self._ambient * relaxed * rise * _mean_growth((self._exponent - 1.0) * rise)
+            return work, self._ambient * (volume - relaxed)
 
     def energies(self, x: Array, frozen: Filling) -> Array:
         """The energy of a chamber in equal parts on its triangles, (n_owned,) [J]."""
@@ -191,32 +229,29 @@ class Chambers(GlobalSums, MovingTargets, WritesTable):
         return self._state(x, frozen)[1] - self._ambient
 
     def add_gradient(self, x: Array, frozen: Filling, out: Array) -> None:
-        add_gradient(x, self.stencil, self._chamber, -self.pressures(x, frozen), out)
+        add_gradient(x, self.stencil, self._chamber, frozen.origin, -self.pressures(x, frozen), out)
 
     def hessians(self, x: Array, frozen: Filling, lo: int, hi: int, convexity: float, out: Array) -> None:
         weight = -(1.0 - convexity) * self.pressures(x, frozen)
-        hessians(x, self.stencil[lo:hi], self._chamber[lo:hi], weight, out)
+        hessians(x, self.stencil[lo:hi], self._chamber[lo:hi], frozen.origin, weight, out)
 
     def dense_hessian(self, x: Array, frozen: Filling) -> tuple[Array, Array]:
         volume, pressure = self._state(x, frozen)
         above = np.maximum(volume, COLLAPSED * self._volume)
         with np.errstate(all="ignore"):
             gas = self._exponent * pressure / above
-        weights = np.where(self._is_gas, gas, BULK_MODULUS / frozen.amount)
+        weights = np.where(self._is_gas, gas, BULK_MODULUS / self._largest)
         vectors = np.zeros((len(weights), *x.shape))
-        for number, vector in enumerate(vectors):
-            add_gradient(x, self.stencil, self._chamber, np.eye(len(weights))[number], vector)
+        for unit, vector in zip(np.eye(len(weights)), vectors, strict=True):
+            add_gradient(x, self.stencil, self._chamber, frozen.origin, unit, vector)
         return weights, vectors
 
     def targets(self, x: Array, frozen: Filling) -> tuple[Array, Array]:
         """The amounts, and this rank's part of the energy's derivatives by them."""
-        volume, _ = self._state(x, frozen)
-        without = self._energies(volume, frozen.amount) - self._ambient * (volume - self._volume)
-        slope = np.where(
-            self._is_gas,
-            self._exponent * without / frozen.amount,
-            0.5 * BULK_MODULUS * (1.0 - (volume / frozen.amount) ** 2),
-        )
+        volume, pressure = self._state(x, frozen)
+        with np.errstate(all="ignore"):
+            of_gas = self._exponent * self._works(volume, frozen.amount)[0] / frozen.amount
+        slope = np.where(self._is_gas, of_gas, pressure)
         return frozen.amount, slope * self._by_chamber(self._share[: self.n_owned])
 
     def table_rows(self, x: Array, frozen: Filling) -> list[tuple[float | str, ...]]:
@@ -292,7 +327,9 @@ def _closed(rest: RestShape, chamber: Chamber, key: str) -> Ints:
             problem = "the surface has no inside: like a Klein bottle it cannot be oriented"
         elif turned:
             which = "the" if turned == len(triangles) else f"{turned} of {len(triangles)}"
-            rest.notes.append(f"{key}: {which} normals point inwards; the pressure acts outwards all the same")
+            rest.notes.append(
+                f"{key}: {which} normals point inwards; the pressure acts outwards all the same"
+            )
     if problem:
         raise InputError(problem, file=file, key=key)
     return triangles
@@ -310,8 +347,8 @@ def _open(mesh: Mesh, triangles: Ints) -> str:
         count = "1 hole" if len(gaps) == 1 else f"{len(gaps)} holes"
         hint = f"; {mesh.unconnected}" if mesh.unconnected else ""
         return (
-            f"the surface is not closed: {count}: {', '.join(listed)}{more}; close, weld or sew it, or name the "
-            f"closed part by group{hint}"
+            f"the surface is not closed: {count}: {', '.join(listed)}{more}; close, weld or sew it, or name "
+            f"the closed part by group{hint}"
         )
     if len(edges := branches(triangles)):
         a, b = edges[0]
@@ -324,4 +361,5 @@ def _open(mesh: Mesh, triangles: Ints) -> str:
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Chambers:
     """The chambers on one rank."""
-    return Chambers(elements, [load.chamber for load in scene.loads if load.chamber is not None])
+    fillings = [load.chamber for load in scene.loads if load.chamber is not None]
+    return Chambers(elements, fillings, static=scene.time.static)

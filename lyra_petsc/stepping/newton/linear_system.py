@@ -180,8 +180,8 @@ class LinearSystem:
         self.factors = PETSc.Options().getString("pc_type", "") in ("cholesky", "lu")
         if equations.active.summing and (direct or self._one_matrix):
             raise InputError(
-                "needs all entries of the matrix, but those of an enclosed volume are only in its products; take "
-                "-ksp_type cg -pc_type cholesky",
+                "needs all entries of the matrix, but those of an enclosed volume are only in products; "
+                "take -ksp_type cg -pc_type cholesky",
                 key="-ksp_type" if direct else "-pc_type",
             )
         self.cycles = multigrid.is_requested()
