@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Makes a mannequin, as an obstacle for garments: body.obj at rest, and walk.npz in which it walks on the spot.
+"""Makes a mannequin, an obstacle for garments: body.obj at rest, and walk.npz, in which it walks on the spot.
 
     python scripts/mannequin.py FOLDER [--triangles 20000] [--frames 120] [--fps 30]
 
-It needs numpy and the extra `view`. The body is the surface at a distance from bones, blended between them; z is up, it looks along y, and its arms
-hang away from its sides. Frame 0 is the body at rest, from which the walk begins smoothly. Each vertex turns
-with the bones near it ("linear blend skinning", as in N. Magnenat-Thalmann, R. Laperrière, D. Thalmann, Graphics
-Interface 1988).
+It needs numpy and the extra `view`. The body is the surface at a distance from bones, blended between them; z is
+up, it looks along y, and its arms hang away from its sides. Frame 0 is the body at rest, from which the walk
+begins smoothly. Each vertex turns with the bones near it (linear blend skinning, as in N. Magnenat-Thalmann,
+R. Laperrière, D. Thalmann, Graphics Interface 1988).
 """
 
 from __future__ import annotations

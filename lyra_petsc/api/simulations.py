@@ -247,7 +247,7 @@ class Simulation:
         run, whole = self._running, self.gather(positions)
 
         def refuse() -> None:
-            from lyra_petsc.contact.overlaps import refuse_crossings  # with kernels
+            from lyra_petsc.contact.start_crossings import refuse_crossings  # with kernels
             from lyra_petsc.mesh.obstacles import build_obstacles
 
             assert self.mesh is not None

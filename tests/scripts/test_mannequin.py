@@ -26,7 +26,7 @@ def test_the_body_is_closed_and_walks(tmp_path: Path) -> None:
     np.testing.assert_allclose(position[0], body.points, atol=1e-6)
     moved = np.linalg.norm(position - position[0], axis=2)
     assert 0.25 < moved[20:].max() < 1.0
-    assert moved[:, body.points[:, 2] > 1.5].max() == 0.0  # the head stays
+    assert moved[:, body.points[:, 2] > 1.5].max() < 1e-6  # the head stays
     speed = np.linalg.norm(np.diff(position, axis=0), axis=2).max(axis=1) * 20.0
     assert speed[0] < 0.1
     assert speed.max() < 4.0
