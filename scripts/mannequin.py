@@ -4,9 +4,9 @@
     python scripts/mannequin.py FOLDER [--triangles 20000] [--frames 120] [--fps 30]
 
 It needs numpy and the extra `view`. The body is the surface at a distance from bones, blended between them;
-z is up, it looks along y, and its arms hang away from its sides. Frame 0 is the body at rest, from which the
-walk begins smoothly. Vertices turn with the bones near them (linear blend skinning, as in N. Magnenat-Thalmann,
-R. Laperrière, D. Thalmann, Graphics Interface 1988).
+z is up, it looks along y, and its arms hang away from its sides. Frame 0 is the body at rest, from which
+the walk begins smoothly. Vertices turn with the bones near them (linear blend skinning, as in N. Magnenat-
+Thalmann, R. Laperrière, D. Thalmann, Graphics Interface 1988).
 """
 
 from __future__ import annotations
