@@ -18,7 +18,7 @@ from lyra_petsc.terms.bending.midedge_shape import (
     transported,
     unit,
 )
-from lyra_petsc.terms.loads.wind import Wind
+from lyra_petsc.terms.loads.wind import Air, Wind
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.protocols import GlobalSums
 from lyra_petsc.terms.stretch_limit import StretchLimit
@@ -168,10 +168,10 @@ def bending_blocks(term: Bending, x: Array, convexity: float) -> Array:
     return out
 
 
-def wind_blocks(term: Wind, v: Array, normals: Array) -> Array:
+def wind_blocks(term: Wind, v: Array, air: Air) -> Array:
     """Element Hessians (E, 3, 3, 3, 3): a ninth of ∂²P/∂v_rel² to each pair of corners."""
     out = np.empty((term.n_elements, 3, 3, 3, 3))
-    wind, density, drag = term._law
+    normals, wind, density, drag = air
     for e, points in enumerate(term.stencil):
         n = normals[e]
         across = np.outer(n, n)

@@ -68,8 +68,8 @@ def _driven(scene: Scene, path: tuple[Any, ...]) -> Driven:
     if isinstance(value, Obstacle):
         keyframes = scene.keyframes(value)
         return DrivenMotion(Motion(keyframes, value.interpolation, file=scene.source) if keyframes else STILL)
-    curve = TimeCurve.of(value)
-    return DrivenCurve(curve.times, curve.values)
+    curve = TimeCurve.of(value, grows=scene.time.static)
+    return DrivenCurve(curve.times, curve.values, grows=curve.grows)
 
 
 def _with(value: Any, path: tuple[Any, ...], driven: Driven) -> Any:

@@ -21,6 +21,7 @@ from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.load import default_scene
 from lyra_petsc.scene.schema import Contact, Friction, Scene, coefficients
+from lyra_petsc.scene.time_curve import curves
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.problem import Problem
 from lyra_petsc.stepping.simulation import SteppedScene
@@ -109,6 +110,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints, tables: list[tuple
         *_sizes(simulation),
         ("active terms", ", ".join(whole.terms)),
         ("handles", str(len(scene.handles))),
+        *_curves(scene),
         *_contact(scene, whole.barrier.gap if whole.barrier else 0.0),
         *tables,
         ("unknowns", f"{problem.points.n_unknowns} (velocities)"),
@@ -150,6 +152,14 @@ def _sizes(simulation: SteppedScene) -> list[tuple[str, str]]:
     return [
         *rows,
         *((one_line(name), str(figure)) for name, figure in zip(names, figures(rest), strict=True)),
+    ]
+
+
+def _curves(scene: Scene) -> list[tuple[str, str]]:
+    """Rows of the plan about values that change in time, or with the load factor."""
+    return [
+        (one_line(key), f"{curve}; steps end at its {len(curve.kinks)} kinks")
+        for key, curve in curves(scene).items()
     ]
 
 

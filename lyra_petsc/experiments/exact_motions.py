@@ -33,6 +33,7 @@ from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.time_curve import acts, largest
 from lyra_petsc.terms.registry import needed_terms
 from lyra_petsc.terms.rest import RestShape
 
@@ -113,7 +114,7 @@ class Body:
     @property
     def gravity(self) -> Array:
         """Gravity (3,) [m/s²]; zero if the scene has none."""
-        return np.asarray(self.scene.gravity or (0.0, 0.0, 0.0), dtype=np.float64)
+        return np.zeros(3) + largest(self.scene.gravity)
 
     @property
     def start_velocity(self) -> Array:
@@ -229,7 +230,7 @@ def _in_still_air(body: Body, drag: str, cosine: float, otherwise: str) -> list[
         "no gravity": not g.any(),
         "initial.velocity": body.start_velocity.any(),
         "no air (wind with velocity [0, 0, 0])": wind is None,
-        "wind that is not still": wind is not None and any(wind.velocity),
+        "wind that is not still": wind is not None and acts(wind.velocity),
         f"wind.{drag} 0": wind is not None and getattr(wind, drag) == 0.0,
         "materials of different densities": np.ptp(densities) > SAME * densities.max(),
     }

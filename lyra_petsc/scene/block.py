@@ -137,10 +137,15 @@ class Described:
     text: str
 
     @property
+    def unit(self) -> str:
+        """The unit; empty if there is none."""
+        unit = _UNIT.search(self.kind)
+        return unit[1] if unit else ""
+
+    @property
     def sentence(self) -> str:
         """The text, followed by the unit in brackets."""
-        unit = _UNIT.search(self.kind)
-        return " ".join(part for part in (self.text, unit[0] if unit and unit[1] else "") if part)
+        return " ".join(part for part in (self.text, f"[{self.unit}]" if self.unit else "") if part)
 
 
 def summary(block: type) -> str:

@@ -27,14 +27,14 @@ class DrivenCurve(TimeCurve):
         return self.continued[-1].at(time) if self.continued else super().at(time)
 
     @property
-    def kinks(self) -> list[float]:
-        """Times [s] at which the slope changes, of those that are known at the start."""
-        return []
+    def varies(self) -> bool:
+        """True, as the program may change it."""
+        return True
 
     @property
-    def largest(self) -> Array:
-        """Not known: NaN, which counts as not zero."""
-        return np.full_like(self.values[0], np.nan)
+    def acts(self) -> bool:
+        """True, as the program may change it."""
+        return True
 
     def saved_state(self) -> list[TimeCurve]:
         """What `restore` returns to."""

@@ -33,6 +33,7 @@ from lyra_petsc.scene.fit_block import Fit
 from lyra_petsc.scene.gas_block import Gas, Liquid
 from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.petsc_block import PetscValue, petsc_options
+from lyra_petsc.scene.time_curve import NumberInTime, VectorInTime, VectorPoints, plain_values
 from lyra_petsc.scene.values import (
     AXES,
     Axis,
@@ -173,8 +174,9 @@ MAX_SPEED = 1e8
 """Largest speed [m/s] in a scene; squares of much larger ones overflow."""
 
 
-def _speed(velocity: Vec3) -> Vec3:
-    require(max(map(abs, velocity)) <= MAX_SPEED, f"must not be faster than {MAX_SPEED:g} m/s")
+def _speed(velocity: Vec3 | VectorPoints) -> Vec3 | VectorPoints:
+    for components in plain_values(velocity):
+        require(max(map(abs, components)) <= MAX_SPEED, f"must not be faster than {MAX_SPEED:g} m/s")
     return velocity
 
 
@@ -186,7 +188,7 @@ class UniformWind(Block):
 
     Attributes
     ----------
-    velocity : (3,) [m/s]
+    velocity : (3,) or curve [m/s]
         Velocity of the air; zero is still air.
     density : float [kg/m³]
         Density of the air.
@@ -194,7 +196,7 @@ class UniformWind(Block):
         Tangential drag coefficient.
     """
 
-    velocity: Velocity
+    velocity: Annotated[VectorInTime, AfterValidator(_speed)]
     density: NonNegative
     drag: NonNegative = 0.0
 
@@ -554,18 +556,23 @@ class Obstacle(Block):
 class AppliedLoad(VertexChoice):
     """A force, a pressure, a traction, a moment, or what fills a closed volume.
 
+    A *curve* is a list of points ``[[t, value], …]``, linear between them and constant before and after, or a
+    ``.csv`` file: a heading, then time and value (or x, y, z) in each line; its path is relative to the scene
+    file. Steps end at its kinks. In a static analysis t is the load factor, and the load does not grow in
+    proportion to it.
+
     Attributes
     ----------
     group : str or None
         A group of the mesh, or the name of a sheet. For pressure and traction a surface group, by default all
         triangles; for a moment a group of boundary edges.
-    force : (3,) [N] or None
+    force : (3,) or curve [N] or None
         Total force, shared by the selected vertices.
-    pressure : float [Pa] or None
+    pressure : float or curve [Pa] or None
         Pressure along the current normal.
-    traction : (3,) [N/m²] or None
+    traction : (3,) or curve [N/m²] or None
         Force per rest area, of fixed direction.
-    moment : float [N·m/m] or None
+    moment : float or curve [N·m/m] or None
         Moment per rest length about the current direction of the boundary edges; a positive one lifts their
         free side towards the normal of the sheet. Needs ``midedge``.
     gas : Gas or None
@@ -581,10 +588,10 @@ class AppliedLoad(VertexChoice):
         "gas: {pressure: 200}, or liquid: {volume: 0.1}"
     }
 
-    force: Vector | None = None
-    pressure: Number | None = None
-    traction: Vector | None = None
-    moment: Number | None = None
+    force: VectorInTime | None = None
+    pressure: NumberInTime | None = None
+    traction: VectorInTime | None = None
+    moment: NumberInTime | None = None
     gas: Gas | None = None
     liquid: Liquid | None = None
     start: Number = Field(default=0.0, alias="from")
@@ -850,7 +857,7 @@ class Scene(Block):
         Source of a sheet, or a list of sources; their vertices are numbered consecutively.
     material : list of Material
         One material, or a list. At most one has no group; it applies to the triangles in no other's group.
-    gravity : (3,) [m/s²] or None
+    gravity : (3,) or curve [m/s²] or None
         Acceleration of gravity; without this key there is none.
     wind : UniformWind or None
         Uniform wind; without this key there is no air.
@@ -885,7 +892,7 @@ class Scene(Block):
     title: Text = ""
     mesh: Annotated[list[MeshSource], BeforeValidator(_one_or_many)]
     material: Annotated[list[Material], BeforeValidator(_one_or_many)]
-    gravity: Vector | None = None
+    gravity: VectorInTime | None = None
     wind: UniformWind | None = None
     handles: Annotated[list[Handle], list_of()] = Field(default_factory=list)
     motions: Annotated[dict[Name, Keyframes], block_of("names")] = Field(default_factory=dict)

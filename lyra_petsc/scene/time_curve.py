@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
@@ -20,6 +20,7 @@ from pydantic_core import PydanticCustomError
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
+from lyra_petsc.scene.block import Block, attributes
 from lyra_petsc.scene.text import read_text
 from lyra_petsc.scene.values import Vec3, cut, number, path_beside, problem, require, shown, vector
 
@@ -31,6 +32,9 @@ MAX_POINTS = 10_000
 
 STRAIGHT = 1e-9
 """Distance of a point from the chord of its neighbours, over the largest value, below which it is no kink."""
+
+IN_TIME = "may change in time"
+"""Mark of the types of such values, by which `curves` knows them from other lists."""
 
 Point = tuple[str, float, Any]
 """Text for messages that locates the point, as file and line; its time, or load factor; its value."""
@@ -47,28 +51,46 @@ class TimeCurve:
     times : (n,)
         Strictly ascending [s].
     values : (n,) or (n, 3)
+    unit : str
+        Of the values, for messages.
+    grows : bool
+        Whether the value is the only one of ``values`` times t instead: that of a load in a static analysis.
     """
 
     times: Array
     values: Array
+    grows: bool = False
+    unit: str = ""
 
     @classmethod
-    def of(cls, value: Any) -> TimeCurve:
-        """The curve of a scene's value: of points, or constant."""
+    def of(cls, value: Any, *, grows: bool = False) -> TimeCurve:
+        """The curve of a scene's value: of points, or constant. A plain value ``grows`` with the time."""
         if isinstance(value, TimeCurve):  # of a program that drives it
             return value
         points = value if is_curve(value) else ((0.0, value),)
-        times, values = zip(*points, strict=True)
-        return cls(np.array(times, dtype=np.float64), np.array(values, dtype=np.float64))
+        times, values = (np.array(part, dtype=np.float64) for part in zip(*points, strict=True))
+        return cls(times, values, grows=grows and not is_curve(value))
 
     def at(self, time: float) -> Array:
         """The value, () or (3,), at a time [s]."""
+        if self.grows:
+            return np.asarray(time * self.values[0])
         i = min(max(int(np.searchsorted(self.times, time, side="right")) - 1, 0), len(self.times) - 1)
         j = min(i + 1, len(self.times) - 1)
         if i == j or time <= self.times[i]:
             return np.asarray(self.values[i])
         part = (time - self.times[i]) / (self.times[j] - self.times[i])
         return np.asarray((1.0 - part) * self.values[i] + part * self.values[j])
+
+    @property
+    def varies(self) -> bool:
+        """Whether there are several points."""
+        return len(self.times) > 1
+
+    @property
+    def acts(self) -> bool:
+        """Whether it is ever other than zero."""
+        return bool(self.values.any())
 
     @property
     def kinks(self) -> list[float]:
@@ -81,6 +103,10 @@ class TimeCurve:
         reach = np.maximum(spans[:-1], spans[1:])[:, None]
         return [float(t) for t in self.times[(changes * reach > STRAIGHT * np.abs(values).max()).any(axis=1)]]
 
+    def __str__(self) -> str:
+        span = f"{len(self.times)} points from {self.times[0]:g} to {self.times[-1]:g}"
+        return f"{span}, up to {np.linalg.norm(self.largest):.4g} {self.unit}".rstrip()
+
     @property
     def largest(self) -> Array:
         """The value, () or (3,), of largest magnitude."""
@@ -88,8 +114,40 @@ class TimeCurve:
         return np.asarray(self.values[int(np.argmax(sizes))])
 
 
+def curves(block: Block, at: str = "") -> dict[str, TimeCurve]:
+    """The values that change in time in a block and the blocks in it, by their keys."""
+    result: dict[str, TimeCurve] = {}
+    for name, field in type(block).model_fields.items():
+        value, key = getattr(block, name), f"{at}{field.alias or name}"
+        inner: dict[str, Any] = {}
+        if isinstance(value, Block):
+            inner = {key: value}
+        elif isinstance(value, dict):
+            inner = {f"{key}.{part}": entry for part, entry in value.items()}
+        elif isinstance(value, list):
+            inner = {f"{key}[{number}]": entry for number, entry in enumerate(value)}
+        elif is_curve(value) and (IN_TIME in field.metadata or _may_be_curve(field.annotation)):
+            result[key] = replace(TimeCurve.of(value), unit=attributes(type(block))[name].unit)
+        for part, entry in inner.items():
+            if isinstance(entry, Block):
+                result |= curves(entry, f"{part}.")
+    return result
+
+
+def _may_be_curve(annotation: Any) -> bool:
+    marked = IN_TIME in getattr(annotation, "__metadata__", ())
+    return marked or any(map(_may_be_curve, get_args(annotation)))
+
+
+def kink_times(block: Block) -> list[float]:
+    """Times [s], or load factors, at which values in a block have kinks."""
+    return [time for curve in curves(block).values() for time in curve.kinks]
+
+
 def is_curve(value: Any) -> bool:
-    """Whether a scene's value is a list of points, not a number or vector."""
+    """Whether a scene's value is a list of points, or driven by a program; not a number or vector."""
+    if isinstance(value, TimeCurve):
+        return True
     return isinstance(value, (list, tuple)) and len(value) > 0 and isinstance(value[0], (list, tuple))
 
 
@@ -108,7 +166,7 @@ def largest(value: Any) -> Array:
 
 def acts(value: Any) -> bool:
     """Whether a scene's value is ever other than zero."""
-    return bool(np.any(largest(value)))
+    return value is not None and TimeCurve.of(value).acts
 
 
 def read_points(path: Path, columns: int) -> list[Point]:
@@ -206,8 +264,8 @@ _NUMBER: dict[str, Any] = {"type": "number"}
 _VECTOR: dict[str, Any] = {"type": "array", "items": _NUMBER, "minItems": 3, "maxItems": 3}
 
 NumberInTime = Annotated[
-    float | NumberPoints, BeforeValidator(partial(_in_time, of_vector=False)), _schema(_NUMBER)
+    float | NumberPoints, BeforeValidator(partial(_in_time, of_vector=False)), _schema(_NUMBER), IN_TIME
 ]
 VectorInTime = Annotated[
-    Vec3 | VectorPoints, BeforeValidator(partial(_in_time, of_vector=True)), _schema(_VECTOR)
+    Vec3 | VectorPoints, BeforeValidator(partial(_in_time, of_vector=True)), _schema(_VECTOR), IN_TIME
 ]

@@ -34,6 +34,7 @@ from lyra_petsc.output.file_operations import reason
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import check_creatable
 from lyra_petsc.output.tensors import is_tensor
+from lyra_petsc.scene.time_curve import largest
 from lyra_petsc.show.render.render_plan import OBSTACLE_COLOR, parse_numbers, pick_state
 
 if TYPE_CHECKING:
@@ -271,7 +272,7 @@ class ExportedStates:
     @property
     def up(self) -> tuple[int, int]:
         """Coordinate axis (0, 1, 2) and sign of the direction against gravity; +z without gravity."""
-        gravity = np.asarray(self.run.scene.gravity or (0.0, 0.0, -1.0))
+        gravity = np.zeros(3) + largest(self.run.scene.gravity)
         axis = int(np.abs(gravity).argmax())
         if gravity[axis] == 0.0:
             return 2, 1

@@ -46,8 +46,9 @@ class ActiveTerms:
     ----------
     elastic, viscous, loads : list of Term
         The terms with an elastic energy, with a potential of the velocities, and the loads.
-    following : list of Load
-        Loads that follow the shape of the sheet.
+    following, varying : list of Load
+        Loads that follow the shape of the sheet; those, and potentials of the velocities, that change in
+        time.
     sheet, external : list of Elastic
         Terms that add to the energy of the sheet, and springs by which handles pull.
     moving, targets, obstacles : list of Elastic
@@ -71,6 +72,8 @@ class ActiveTerms:
         self.viscous = [term for term in terms if isinstance(term, Viscous)]
         self.loads = [term for term in terms if isinstance(term, Load)]
         self.following = [load for load in self.loads if load.is_follower]
+        changing: list[Load | Viscous] = [*self.loads, *self.viscous]
+        self.varying = [term for term in changing if term.varies]
         roles = {term: term.registration.role for term in self.elastic}
         self.external = [term for term in self.elastic if roles[term] is Role.EXTERNAL]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]

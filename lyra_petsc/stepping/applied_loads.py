@@ -1,4 +1,4 @@
-"""Loads of a step, and their factor in a static analysis."""
+"""Loads of a step, and what a static analysis makes of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.terms.term import Load
+from lyra_petsc.terms.term import Load, UpcomingStep
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.statics.following_loads import FollowingLoads
@@ -45,37 +45,31 @@ class LoadCase:
 
     Attributes
     ----------
-    factor : float
-        Load factor.
     unbalanced : (n_owned, 3) or None
-        Force [N] that holds the start shape in balance, reduced as the factor grows.
+        Force [N] that holds the start shape in balance, reduced as the load factor grows.
     override : (n_owned, 3) or None
         Force [N] in place of the loads.
     following : FollowingLoads or None
         Change of loads that follow the shape within a solve.
     """
 
-    factor: float = 1.0
     unbalanced: Array | None = None
     override: Array | None = None
     following: FollowingLoads | None = None
 
-    def loads(
-        self, terms: Sequence[Load], t0: float, t1: float, x: Array, n_owned: int, wind: Array | None
-    ) -> StepLoads:
-        """The loads of a step from t0 to t1 [s] at positions x (n_local, 3).
+    def loads(self, terms: Sequence[Load], step: UpcomingStep, n_owned: int, wind: Array | None) -> StepLoads:
+        """The loads of a step.
 
         ``wind`` (n_owned, 3) [N] is the gradient of velocity potentials, if these count as loads.
         """
         if self.override is not None:
             return StepLoads(self.override, self.following)
-        every = np.zeros_like(x)
+        every = np.zeros_like(step.x)
         for load in terms:
-            load.add_force(x, t0, t1, every)
+            load.add_force(step, every)
         force = every[:n_owned]
         if wind is not None:
             force -= wind
-        force *= self.factor
         if self.unbalanced is not None:
-            force += (1.0 - self.factor) * self.unbalanced
+            force += (1.0 - step.target_time) * self.unbalanced
         return StepLoads(force, self.following)

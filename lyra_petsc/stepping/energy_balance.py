@@ -20,6 +20,7 @@ from lyra_petsc.stepping.state import kinetic_energy
 from lyra_petsc.stepping.time_step import Evaluation
 from lyra_petsc.terms.energies import ENERGIES
 from lyra_petsc.terms.protocols import Dissipates, MovingTargets, PullsHandles
+from lyra_petsc.terms.term import Load
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
 
@@ -102,6 +103,35 @@ def _work_of(force: Array, x_before: Array, x: Array) -> float:
     """Work [J] of forces (n, 3) [N] over x - x_before, in parts to save memory."""
     x, parts = x[: len(force)], (slice(lo, lo + ROWS) for lo in range(0, len(force), ROWS))
     return sum(float(np.vdot(force[rows], x[rows] - x_before[rows])) for rows in parts)
+
+
+def varying_force(equations: StageEquations, x: Array, v: Array, time: float) -> Array:
+    """Force (n_local, 3) [N] of the loads that change in time at a time [s] of the step, with positions and
+    velocities x, v (n_local, 3).
+    """
+    step, force = equations.targets_at(time, x), np.zeros_like(x)
+    for term in equations.active.varying:
+        if isinstance(term, Load):
+            term.add_force(step, force)
+        else:
+            term.add_gradient(v, term.freeze(step), against := np.zeros_like(x))
+            force -= against
+    return force
+
+
+def _work_besides_stage(equations: StageEquations, x_before: Array) -> float:
+    """Work [J] of the loads that change in time, in the step from x_before (n_owned, 3) [m], by the mean of
+    both ends less that by their values at the stage, which backward Euler's identity has.
+    """
+    step, at = equations.step, equations.evaluated
+    if not equations.active.varying or equations.integrator.order == 1:
+        return 0.0
+    start, end, stage = (
+        varying_force(equations, at.x, at.v, t) for t in (step.start, step.end, step.at_stage)
+    )
+    moved = equations.x[: len(x_before)] - x_before
+    more = (0.5 * (start + end) - stage)[: len(moved)]
+    return float(np.vdot(more, np.where(step.prescribed.free, moved, 0.0)))
 
 
 def _obstacle_works(equations: StageEquations, x_before: Array) -> tuple[float, float]:
@@ -227,6 +257,7 @@ class EnergyBalance:
             )
         by_targets += _move_targets_to_end(equations)
         work = _work_of(external, x_before, equations.x) + by_targets
+        work += _work_besides_stage(equations, x_before)
         del external  # to save memory
         here = equations.here()
         fabric = sum(term.heat(here.x, here.frozen[term]) for term in equations.active.dissipating)
@@ -263,12 +294,11 @@ class EnergyBalance:
         self._at = at = equations.step.prescribed.indices
         self._reactions, damping, heat = np.zeros(len(at)), np.zeros(len(at)), 0.0
         self._reactions += equations.contact_end.impulses.handle_force
-        weight = np.zeros((equations.points.n_local, 3))
+        weight, here = np.zeros((equations.points.n_local, 3)), equations.targets_at(equations.step.at_stage)
         for load in equations.active.loads:
             if load.registration.energy:  # loads with a potential do no external work
-                load.add_force(equations.x, 0.0, 0.0, weight)
-        external = weight[: equations.points.n_owned]
-        external *= -equations.load_case.factor
+                load.add_force(here, weight)
+        external = -weight[: equations.points.n_owned]
         for name, part in parts:
             self._reactions += part.take(at)
             if name in ("loads", "springs", "friction", "wind"):

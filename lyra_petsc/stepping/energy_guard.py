@@ -22,6 +22,10 @@ and W are those of an observer who moves with the scene's initial velocity: a sh
 along with it is judged as one at rest. (Another observer finds another G, as the trapezoidal rule does not
 give the change of momentum.) G < 0 is numerical dissipation, which is allowed and summed up.
 
+Of loads that change in time by Δf at fixed positions and velocities, the trapezoidal rule leaves
+Δt |Δf · Δv|/12 open, the difference to the integral for a velocity that is linear in time: at the start of a
+ramp half of W. A gain within that is none.
+
 Backward Euler has an identity instead, in which W is the work of the forces at the end of the step::
 
     Δ(T + U + V) + D − W = −½ ‖Δv‖²_M + bracket        bracket = U(x_{n+1}) − U(x_n) − ∇U(x_{n+1})·Δx
@@ -41,7 +45,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.stepping.energy_balance import EnergyBalance
+from lyra_petsc.stepping.energy_balance import EnergyBalance, varying_force
 from lyra_petsc.stepping.newton.force_scales import ROUNDOFF
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Elastic
@@ -80,6 +84,8 @@ class Gain:
         ½ ‖Δv‖²_M, and this plus the change of energy that the work of the stage's forces does not explain.
     noise : float
         Round-off of the gain.
+    doubt : float
+        Part of the work that the trapezoidal rule leaves open.
     """
 
     gain: float
@@ -92,6 +98,7 @@ class Gain:
     inertia: float
     bracket: float
     noise: float
+    doubt: float = 0.0
 
 
 class StepEndState(NamedTuple):
@@ -151,12 +158,14 @@ class EndForces:
             uniform_heat = float(np.vdot(force, (x1 - x0)[: len(force)]))
         work, *of_targets = self._target_works(ends)
         work += self._load_work(ends, moved) + self._handle_work(ends, moved, damping)
+        doubt = self._doubt(ends) if equations.active.varying else 0.0
         # rounded positions at both ends of a step differ in energy, and in velocity
         largest = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
         stiff = (self._stiffness_sum + float(equations.mass.sum()) / equations.step.dt**2) * largest**2
         energies = *self._energies(ends[0]), *self._energies(ends[1])
-        sums = layout.global_sum(*energies, work, *of_targets, stiff, uniform_heat).tolist()
-        free0, all0, potential0, free1, all1, potential1, work, rise, springs0, springs1, stiff, warm = sums
+        sums = layout.global_sum(*energies, work, *of_targets, stiff, uniform_heat, doubt).tolist()
+        free0, all0, potential0, free1, all1, potential1, work, rise, springs0, springs1 = sums[:10]
+        stiff, warm, doubt = sums[10:]
         work += 0.5 * (account.obstacle_work_at_start + account.obstacle_work)
         before, after = account.before, account.after
         rise += (after.elastic - account.moving) - (before.elastic - account.moving_before)
@@ -176,6 +185,7 @@ class EndForces:
             inertia=account.inertia,
             bracket=account.bracket + more,
             noise=ROUNDOFF * (sizes + math.sqrt(2.0 * abs(energy1) * stiff) + ROUNDOFF * stiff),
+            doubt=abs(doubt),
         )
 
     def _at(self, x: Array, v: Array, time: float) -> StepEndState:
@@ -253,8 +263,7 @@ class EndForces:
         force = np.zeros_like(ends[1].x)
         for load in forces:
             for end in ends:
-                x = end.x if load.is_follower else ends[1].x
-                load.add_force(x, equations.step.start, equations.step.end, force)
+                load.add_force(equations.targets_at(end.time, end.x), force)
         force = force[:n]
         if equations.active.viscous:
             start = self._start.get("wind")
@@ -264,10 +273,18 @@ class EndForces:
         free = np.where(equations.step.prescribed.free, moved, 0.0)
         return 0.5 * float(np.vdot(force, free))
 
+    def _doubt(self, ends: tuple[StepEndState, StepEndState]) -> float:
+        """Δt Δf · Δv/12 [J] of this rank's free coordinates, Δf the change of the loads in time alone."""
+        equations, (start, end) = self._equations, ends
+        before, after = (varying_force(equations, end.x, end.v, time) for time in (start.time, end.time))
+        free = equations.step.prescribed.free
+        gained = np.where(free, (end.v - start.v)[: len(free)], 0.0)
+        return equations.step.dt / 12.0 * float(np.vdot((after - before)[: len(free)], gained))
+
     def _wind(self, end: StepEndState, n: int) -> Array:
         """Gradient (n, 3) [N] of the wind's potential."""
         equations, out = self._equations, np.zeros_like(end.x)
-        step = equations.targets_at(equations.step.start, end.x)
+        step = equations.targets_at(end.time, end.x)
         for term in equations.active.viscous:
             term.add_gradient(end.v, term.freeze(step), out)
         return out[:n]
@@ -289,7 +306,7 @@ class EndForces:
             for term in self._targets:
                 term.add_gradient(end.x, end.frozen[term], targets)
         for load in self._weights:
-            load.add_force(ends[1].x, step.start, step.end, weight)
+            load.add_force(equations.targets_at(step.end), weight)
         force = 0.5 * ((start + pull).take(at) + targets.ravel()[at]) - weight.ravel()[at] + damping
         force += equations.contact_end.impulses.handle_force
         return float(np.vdot(force, displacement))
@@ -395,7 +412,7 @@ class EnergyGuard:
         """State of the guard after accepting a step."""
         old = self.gains
         start = step.potential_before if old.start is None else old.start
-        judged = step.gain
+        judged = step.gain - min(max(step.gain, 0.0), step.doubt)
         if self._is_backward_euler:
             judged = min(judged, step.bracket - step.inertia)
         work, heat = old.work + abs(step.work), old.heat + step.heat

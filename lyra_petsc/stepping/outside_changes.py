@@ -13,7 +13,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.stepping.problem import refuse_contact, refuse_overrun
 from lyra_petsc.terms.registry import Registration, Role
-from lyra_petsc.terms.term import Load
+from lyra_petsc.terms.term import Load, UpcomingStep
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.simulation import SteppedScene
@@ -33,7 +33,7 @@ class ProgramForces(Load):
         self.forces = forces.copy()
         run.expect_jump(run.time)
 
-    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
+    def add_force(self, step: UpcomingStep, out: Array) -> None:
         out[: len(self.forces)] += self.forces
 
 

@@ -44,6 +44,7 @@ from lyra_petsc.stepping.perturbed_scenes import (
 )
 from lyra_petsc.stepping.problem import Problem
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
+from lyra_petsc.stepping.statics.equilibrium import start_force
 from lyra_petsc.stepping.statics.pseudo_time import MAX_GROWTH
 from lyra_petsc.terms.bending.midedge_shape import Frames
 
@@ -152,10 +153,9 @@ class Sensitivities:
         for scene in tangent.perturbed:
             equations = scene.equations
             if self._static:
-                equations.take_loads(factor=0.0)
-                equations.begin_step(0.0, 0.0)
+                force = start_force(equations)
                 if self._equations.load_case.unbalanced is not None:
-                    equations.take_loads(unbalanced=-equations.out_of_balance())
+                    equations.take_loads(unbalanced=-force)
             if reactions:
                 scene.energy_balance = EnergyBalance(equations)
 
@@ -333,7 +333,6 @@ class Sensitivities:
             equations = scene.equations
             equations.state.set(now.x + scene.change * dx, np.zeros_like(now.x))
             scene.set_frames(now.frames)
-            equations.take_loads(factor=self._equations.load_case.factor)
             equations.begin_step(now.before, now.factor)
             return -equations.out_of_balance()
 

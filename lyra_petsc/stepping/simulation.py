@@ -21,6 +21,7 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.time_curve import kink_times
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.accuracy import Accuracy
 from lyra_petsc.stepping.compression_watch import CompressionWatch
@@ -146,7 +147,8 @@ class SteppedScene:
         self.notes.extend(on_root(self.comm, lambda: unknown(self.stepper.our_options)))
         self.roundoff = floor
         self.max_steps = self.stepper.solver.ts.getMaxSteps()
-        self.control = planned_control(scene, self.stepper.solver.ts, [*event_times(scene), *self._stops])
+        events = [*event_times(scene), *kink_times(scene)]
+        self.control = planned_control(scene, self.stepper.solver.ts, [*events, *self._stops])
         self.accuracy: Accuracy | None = None
         if isinstance(self.control, ToleranceControl):
             self.accuracy = Accuracy(equations, self.control, scene.time.tolerance or 0.0, whole.size)
@@ -165,7 +167,7 @@ class SteppedScene:
             if isinstance(term, Dissipates):  # whose rest state has edges in equilibrium
                 term.initialise(equations.x)
         start = equations.here()
-        self.notes.extend(nothing_acts(scene, start, event_times(scene), self.control.end, floor))
+        self.notes.extend(nothing_acts(scene, start, events, self.control.end, floor))
         self.equilibrium: Equilibrium | None = None
         if scene.time.static:
             sizes = whole.spacing, whole.size, floor, self.control.end

@@ -192,8 +192,9 @@ class StageEquations:
 
     def _freeze(self, at: float, x: Array) -> None:
         """Freeze geometry at positions x (n_local, 3), targets and loads at the time ``at`` [s]."""
-        lagged, step = self.integrator.lagged_loads, self.step
-        frozen = self.active.freeze(self.targets_at(at, x))
+        lagged = self.integrator.lagged_loads
+        there = self.targets_at(at, x)
+        frozen = self.active.freeze(there)
         self.directors.begin_step()
         if (geometry := self.state.geometry(frozen)) is None:
             self.state.evaluation = None  # its forces are those with other frames
@@ -201,7 +202,7 @@ class StageEquations:
         wind = self.forces.sum(viscous, self.v, frozen) if viscous else None
         self.change(
             frozen=frozen,
-            loads=self.load_case.loads(self.active.loads, step.start, step.end, x, len(self.mass), wind),
+            loads=self.load_case.loads(self.active.loads, there, len(self.mass), wind),
             x=self.x,
             size=float(np.abs(self.x).max(initial=0.0)),
             linear=not self.integrator.iterates,

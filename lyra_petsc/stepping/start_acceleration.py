@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.applied_loads import LoadCase
 from lyra_petsc.stepping.forces import StageForces
 from lyra_petsc.stepping.integrators.in_use import IntegratorsInUse
 from lyra_petsc.stepping.integrators.integrator import NeedsAcceleration
@@ -101,12 +102,13 @@ class StartAcceleration:
             rates = self._prescriptions.rates(step.prescribed, step.start, step.end, soon)
             step.prescribed.overwrite(v[: len(mass)], rates)
         layout.update_ghosts(v)
-        if active.moving or active.external:
-            # at the stage targets are farther, and an obstacle may be where the sheet still is now
-            there = step.upcoming(step.start, x, self._prescriptions.reference)
-            at_start = step.changed(frozen=active.with_targets(step.frozen, there))
-        else:
-            at_start = step
+        # at the stage targets are farther, an obstacle may be where the sheet is now, and loads are others
+        there = step.upcoming(step.start, x, self._prescriptions.reference)
+        frozen = dict(active.with_targets(step.frozen, there))
+        frozen |= {term: term.freeze(there) for term in active.viscous}
+        wind = forces.sum(active.viscous, state.v, frozen) if step.lagged and active.viscous else None
+        loads = LoadCase().loads(active.loads, there, len(mass), wind)
+        at_start = step.changed(frozen=frozen, loads=loads)
         geometry = (state.evaluation or Evaluation(at_start, state.x, v, forces)).geometry
         if forces.damps and layout.n_edges_global:
             self._balance_moments(at_start, v, geometry)

@@ -12,11 +12,12 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.topology import connected_pieces
 from lyra_petsc.scene.schema import Keyframe, Scene
+from lyra_petsc.scene.time_curve import acts, kink_times
 from lyra_petsc.scene.values import AXES
 from lyra_petsc.stepping.time_step import Evaluation
 from lyra_petsc.terms.registry import Registration, Role, make_term
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Load
+from lyra_petsc.terms.term import Load, UpcomingStep
 
 BALANCED = 1e-9
 """Resultant of loads over the sum of their magnitudes up to which they are in balance."""
@@ -40,7 +41,7 @@ def nothing_acts(
     """
     motions = [*scene.motions.values(), *map(scene.keyframes, (scene.obstacles or {}).values())]
     moves = any(frame != Keyframe(time=frame.time) for frames in motions for frame in frames)
-    if moves or (scene.wind is not None and any(scene.wind.velocity)):
+    if moves or (scene.wind is not None and acts(scene.wind.velocity)):
         return []
     comm, active, stops = (
         start.forces.layout.comm,
@@ -49,8 +50,8 @@ def nothing_acts(
     )
     acting = float(np.abs(start.v).max(initial=0.0))
     for t0, t1 in itertools.pairwise(stops):
-        for load in active.loads:
-            load.add_force(start.x, t0, t1, force := np.zeros_like(start.x))
+        for load, at in itertools.product(active.loads, (t0, t1)):
+            load.add_force(_during(t0, t1, at, start.x), force := np.zeros_like(start.x))
             acting += float(np.abs(force).max(initial=0.0))
     gradient = start.forces.sum(active.elastic, start.x, start.frozen)
     acting, square = comm.allreduce(np.array([acting, float(np.vdot(gradient, gradient))]))
@@ -60,6 +61,11 @@ def nothing_acts(
         "nothing acts on the sheet: it starts at rest and free of stress, without gravity, loads, wind or "
         "motions, so it stays as it is"
     ]
+
+
+def _during(t0: float, t1: float, at: float, x: Array) -> UpcomingStep:
+    """A step from t0 to t1 [s] as loads see it at the time ``at`` [s] and positions x (n, 3)."""
+    return UpcomingStep(t0, t1, at, x, lambda start, rows: x[rows])
 
 
 def nothing_holds(
@@ -77,11 +83,14 @@ def nothing_holds(
         return []
     piece = np.empty(mesh.n_vertices, dtype=np.int64)
     piece[mesh.triangles] = connected_pieces(mesh.triangles)[:, None]
-    force: Array = np.zeros((mesh.n_vertices, 3))
+    factors = {1.0, *(factor for factor in kink_times(scene) if 0.0 <= factor <= 1.0)}
+    forces: Array = np.zeros((len(factors), mesh.n_vertices, 3))
     for entry in loads:
         term = make_term(entry, elements.get(entry.name), scene, rest.mass)
         assert isinstance(term, Load)
-        term.add_force(mesh.positions, 0.0, 1.0, force)
+        for force, factor in zip(forces, sorted(factors), strict=True):
+            term.add_force(_during(0.0, 1.0, factor, mesh.positions), force)
+    force = max(forces, key=lambda force: float(np.linalg.norm(force)))
     held = np.zeros((piece.max() + 1, 3), dtype=bool)
     for number, handle in enumerate(scene.handles):
         vertices = select_vertices(mesh, handle, key=f"handles[{number}]", file=scene.source)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.scene.schema import Scene, coefficients
+from lyra_petsc.scene.time_curve import acts, is_curve
 from lyra_petsc.terms.energies import BENDING, MEMBRANE, POTENTIAL
 
 if TYPE_CHECKING:
@@ -191,9 +192,15 @@ REGISTRY: list[Registration] = [
     ),
     Registration(
         "gravity",
-        lambda scene, shells: scene.gravity is not None and any(scene.gravity),
+        lambda scene, shells: acts(scene.gravity) and not is_curve(scene.gravity),
         Role.LOAD,
         POTENTIAL,
+        module_name=".loads.gravity",
+    ),
+    Registration(
+        "varying_gravity",
+        lambda scene, shells: acts(scene.gravity) and is_curve(scene.gravity),
+        Role.LOAD,
         module_name=".loads.gravity",
     ),
     Registration(

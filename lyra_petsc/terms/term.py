@@ -12,7 +12,7 @@ They are passed to every other method as ``frozen``, so that no result depends o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
 from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.time_curve import TimeCurve
+from lyra_petsc.terms.handles.motion import Window
 
 if TYPE_CHECKING:
-    from lyra_petsc.terms.handles.motion import Window
     from lyra_petsc.terms.registry import Registration
 
 Offsets = NDArray[np.int32] | NDArray[np.int64]
@@ -220,6 +222,9 @@ class Elastic(Term):
 class Viscous(Term):
     """A potential of the velocities, with the geometry frozen at the start of the step."""
 
+    varies = False
+    """Whether it changes in time at fixed positions and velocities."""
+
     @abstractmethod
     def potentials(self, v: Array, frozen: Any) -> Array:
         """Potential [W] of each owned element, (n_owned,); its gradient is minus the force."""
@@ -239,16 +244,19 @@ class Load(Term):
     is_follower: ClassVar[bool] = False
     """Whether the force depends on the positions."""
 
+    varies = False
+    """Whether the force changes in time at fixed positions, apart from where it begins and ends."""
+
     def connect(self, terms: Iterable[Term]) -> None:
         """Look up the other terms of the scene that this one needs; called before all other methods."""
 
     @abstractmethod
-    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        """Add the force [N] during the step from t0 to t1 [s], which starts at positions x, to ``out``."""
+    def add_force(self, step: UpcomingStep, out: Array) -> None:
+        """Add the force [N] during a step, that at its ``target_time`` with the shape ``x``, to ``out``."""
 
-    def add_force_on_vertices(self, x: Array, t0: float, t1: float, out: Array) -> None:
+    def add_force_on_vertices(self, step: UpcomingStep, out: Array) -> None:
         """As `add_force`, without generalised forces on edges, which do not depend on the positions."""
-        self.add_force(x, t0, t1, out)
+        self.add_force(step, out)
 
     def potential(self, x: Array) -> float:
         """Potential energy [J] of this rank's elements; 0 for a load without a potential."""
@@ -262,15 +270,27 @@ class WindowedLoad(Load):
     ----------
     elements : Elements
         With data ``load`` (E,), the number of the scene's load that acts on an element.
-    windows : sequence of Window
-        Windows of all loads of the scene.
+    scene : Scene
+        In a static analysis plain values of its loads grow with the load factor.
+    keys : str
+        Those of its loads that act by this term.
     """
 
-    def __init__(self, elements: Elements, windows: Sequence[Window]) -> None:
+    def __init__(self, elements: Elements, scene: Scene, *keys: str) -> None:
         super().__init__(elements)
-        self._load = elements.data["load"].astype(np.int64)
-        self._windows = windows
+        acting = {
+            number: (Window(load.start, load.until), TimeCurve.of(load.get(key), grows=scene.time.static))
+            for number, load in enumerate(scene.loads)
+            for key in load.present(*keys)
+        }
+        self._row = np.searchsorted(list(acting), elements.data["load"])
+        self._acting = list(acting.values())
+        self.varies = any(curve.varies for _, curve in self._acting)
 
-    def strength(self, t0: float, t1: float) -> Array:
-        """Fraction (E,) of the load on each element that acts in the step from t0 to t1 [s]."""
-        return np.array([window.strength(t0, t1) for window in self._windows])[self._load]
+    def values(self, step: UpcomingStep) -> Array:
+        """Value (E,) or (E, 3) of the load on each element in a step, 0 outside of its window."""
+        rows = [
+            window.strength(step.start, step.end) * curve.at(step.target_time)
+            for window, curve in self._acting
+        ]
+        return np.array(rows)[self._row]

@@ -15,6 +15,7 @@ import numpy as np
 
 from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.materials.library import ShellMaterial
+from lyra_petsc.scene.time_curve import acts, largest
 from lyra_petsc.terms.rest import RestShape
 
 LIGHTEST, LIGHTEST_CLOTH, DENSEST = 10.0, 22.0, 25e3
@@ -123,7 +124,7 @@ class Figures:
 
 def figures(rest: RestShape) -> list[Figures]:
     """The figures of all materials of a scene."""
-    gravity = math.hypot(*rest.scene.gravity or ()) or STANDARD_GRAVITY
+    gravity = float(np.linalg.norm(largest(rest.scene.gravity))) or STANDARD_GRAVITY
     return [Figures.of(shell, gravity) for shell in rest.shells]
 
 
@@ -136,7 +137,7 @@ def unit_notes(rest: RestShape) -> list[str]:
             f"mesh: the sheet is {size:.4g} m large; if its file is in millimetres, give it "
             "transform: {scale: 0.001}"
         )
-    weighs = not scene.time.static or bool(scene.gravity and any(scene.gravity))
+    weighs = not scene.time.static or acts(scene.gravity)
     for number, (block, figure) in enumerate(zip(scene.material, figures(rest), strict=True)):
         if doubt := figure.doubt(block, size, weighs=weighs):
             notes.append(f"material[{number}]: {doubt}" if len(scene.material) > 1 else f"material: {doubt}")

@@ -19,11 +19,11 @@ from lyra_petsc.experiments.verification.rods import pressed_tip
 from lyra_petsc.experiments.verification.verification_case import STATIC, scene
 from lyra_petsc.phases import Phases
 from lyra_petsc.stepping.statics.following_loads import FollowingLoads, newton_displacement
-from lyra_petsc.terms.term import Load
+from lyra_petsc.terms.term import Load, UpcomingStep
 
 
 def force_of(load: Load, x: Array, out: Array) -> None:
-    load.add_force(x, 0.0, 1.0, out)
+    load.add_force(UpcomingStep(0.0, 1.0, 0.5, x, lambda start, rows: x[rows]), out)
 
 
 def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
@@ -32,7 +32,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
     equations, random = simulation.problem.equations, np.random.default_rng(0)
     x = equations.x + 0.1 * random.normal(size=equations.x.shape)
     u, direction = (0.1 * random.normal(size=x.shape) for _ in range(2))
-    loads = FollowingLoads(equations.active.loads, x, force_of, 0.5)
+    loads = FollowingLoads(equations.active.loads, x, force_of)
 
     force, change = np.zeros_like(x), np.zeros_like(x)
     loads.add_force(x + u, force)
@@ -50,10 +50,10 @@ def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
     inside = (np.abs(equations.x[:, :1] - 0.5) < 0.4) & (np.abs(equations.x[:, 1:2] - 0.35) < 0.3)
     direction *= inside
     there, back, change = (np.zeros_like(x) for _ in range(3))
-    equations.active.loads[0].add_force(x + 1e-6 * direction, 0.0, 1.0, there)
-    equations.active.loads[0].add_force(x - 1e-6 * direction, 0.0, 1.0, back)
+    force_of(equations.active.loads[0], x + 1e-6 * direction, there)
+    force_of(equations.active.loads[0], x - 1e-6 * direction, back)
     loads.add_force(x + direction, change)
-    expected = 0.5 * (there - back) / 2e-6
+    expected = (there - back) / 2e-6
     np.testing.assert_allclose(change * inside, expected * inside, rtol=0, atol=1e-6 * np.abs(change).max())
     simulation.destroy()
 

@@ -43,7 +43,7 @@ def paper_step(equations: StageEquations, time: float, dt: float) -> Array:
         stiffness = summed(term.stencil, blocks_of(term, x, frozen, 1.0), len(x))
         a += dt * (dt + damping) * stiffness.reshape(len(a), len(a))
     for load in equations.active.loads:
-        load.add_force(x, time, time + dt, force)
+        load.add_force(equations.targets_at(time + dt, x), force)
     for wind in equations.active.viscous:
         force -= gradient(wind, v_old, equations.step.frozen[wind])
     b = mass * v_old.ravel() + dt * force.ravel()

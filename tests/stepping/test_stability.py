@@ -121,7 +121,7 @@ def test_the_hessian_is_the_derivative_of_all_forces(name: str) -> None:
     scene = PRESSED | {"material": CLOTH | {"bending": 0.1}, "initial": {"noise": 0.02}} | FOLLOWING[name]
     simulation = SteppedScene(MPI.COMM_SELF, scene_of(scene))
     equations = simulation.problem.equations
-    equations.take_loads(factor=0.7, unbalanced=None)
+    equations.take_loads(unbalanced=None)
     equations.x[:, 0] *= 0.95
     equations.state.forget()
     equations.begin_step(0.3, 0.7)

@@ -261,7 +261,6 @@ def test_a_static_analysis_starts_in_equilibrium(comm: MPI.Comm) -> None:
     with motion(comm, **still, time={"analysis": "static"}) as simulation:
         equations, left = simulation.problem.equations, []
         for factor in (0.0, 0.5, 1.0):
-            equations.take_loads(factor=factor)
             equations.begin_step(0.0, factor)
             left.append(comm.allreduce(np.abs(equations.out_of_balance()).max(initial=0.0), MPI.MAX))
         assert left[0] < 1e-12 * left[2]

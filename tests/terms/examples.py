@@ -31,6 +31,7 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
         ],
     },
     "gravity": {"gravity": [0.3, -1.0, -9.0]},
+    "varying_gravity": {"gravity": [[0.0, [0.0, 0.0, 0.0]], [0.1, [0.3, -1.0, -9.0]]]},
     "wind": {"wind": {"velocity": [1.0, 2.0, -3.0], "density": 1.2, "drag": 0.4}},
     "pressure": {"loads": [{"pressure": 7.0}]},
     "force": {"loads": [{"nodes": [3, 4], "force": [1.0, 2.0, 3.0]}, {"traction": [0.0, 5.0, -1.0]}]},

@@ -303,7 +303,7 @@ def test_potential_of_a_load_is_minus_its_work(term: Term, simulation: Simulatio
     assert isinstance(term, Load)
     x = simulation.equations.x
     force = np.zeros_like(x)
-    term.add_force(x, 0.0, 0.01, force)
+    term.add_force(UpcomingStep(0.0, 0.01, 0.01, x, simulation.equations.reference.at), force)
     assert np.abs(force).max() > 0.0
     other = disturbed(simulation, 0.1)
     change = term.potential(other) - term.potential(x)

@@ -12,7 +12,7 @@ from oracle import frozen_by, gradient
 from physics import Simulation, grid, obj_file, rotation
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.terms.term import Load, Viscous
+from lyra_petsc.terms.term import Load, UpcomingStep, Viscous
 
 #: a unit square of two triangles with a curve group of unequal edges, a surface and a point group
 GEO = """
@@ -26,10 +26,11 @@ Physical Surface("sheet") = {1}; Physical Curve("base") = {1}; Physical Point("c
 
 def force_of(simulation: Simulation, t0: float = 0.0, t1: float = 0.01) -> Array:
     """Force (V, 3) [N] of all loads in the present state, in mesh order."""
-    out = np.zeros_like(simulation.equations.x)
+    equations = simulation.equations
+    out = np.zeros_like(equations.x)
     for term in simulation.problem.terms.values():
         if isinstance(term, Load):
-            term.add_force(simulation.equations.x, t0, t1, out)
+            term.add_force(UpcomingStep(t0, t1, t1, equations.x, equations.reference.at), out)
     return simulation.gather(out)
 
 

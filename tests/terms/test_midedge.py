@@ -816,7 +816,7 @@ def test_a_moment_does_work_on_the_rotation_of_directors() -> None:
         x += random.uniform(-0.2, 0.2, x.shape)
         direction = random.uniform(-1.0, 1.0, x.shape)
         force = np.zeros_like(x)
-        load.add_force(x, 0.0, 0.0, force)
+        load.add_force(simulation.equations.targets_at(0.0, x), force)
 
         def shape(at: Array) -> Array:
             return bending._directors(at, bending.frames)[:, :3]

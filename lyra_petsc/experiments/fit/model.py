@@ -22,6 +22,7 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.time_curve import curves
 from lyra_petsc.stepping.perturbed_scenes import SceneParameter
 from lyra_petsc.stepping.sensitivity import Sensitivities
 from lyra_petsc.terms.protocols import Dissipates, LimitsStep
@@ -253,7 +254,13 @@ def value_of(scene: Scene, key: str, *, at: str) -> float:
         If there is no number.
     """
     target: Any = scene
-    for part in _parts(key):
+    parts = _parts(key)
+    for curve in curves(scene):
+        own = _parts(curve)
+        if parts[: len(own)] == own and parts[len(own) + 1 : len(own) + 2] != ["1"]:
+            text = f"is no value of a point; only those of a curve can be varied, as in {curve}[0][1]"
+            raise InputError(text, file=scene.source, key=f"{at}.{key}")
+    for part in parts:
         if target is None:
             break
         if part.isdecimal() and isinstance(target, (list, tuple)):

@@ -31,6 +31,7 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.scene import time_curve
 from lyra_petsc.stepping.energy_balance import StepAccount
 from lyra_petsc.stepping.newton.force_scales import ROUNDOFF, residual_roundoff
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
@@ -239,7 +240,7 @@ class BalanceRecorder:
         dx, sheet = x1 - x0, self._frozen(self._sheet_terms)
         frames = {term: old for term, old in self._frames.items() if sheet[term].number != old.number}
         parts, within = self._force_terms(dt)
-        size_of_g = float(np.linalg.norm(simulation.scene.gravity or 0.0))
+        size_of_g = float(np.linalg.norm(time_curve.largest(simulation.scene.gravity)))
         turned, inner, free_dx, all_dx, energy_noise, forces, powers, heights = layout.global_sum(
             energy(self._frozen(self._turning), x0) - self._turning_energy,
             float(np.vdot(parts["internal"], dx[:n])),
@@ -313,7 +314,7 @@ class BalanceRecorder:
             frozen |= {term: term.freeze(step) for term in moved}
         force, wind = np.zeros_like(x), np.zeros_like(x)
         for load in equations.active.loads:
-            load.add_force(y, equations.step.start, equations.step.end, force)
+            load.add_force(step, force)
         for term in equations.active.viscous:
             term.add_gradient(v, term.freeze(step), wind)
         rate = stage.sigma * (v[:n] - equations.step.v_h)

@@ -14,6 +14,7 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.scene.camera_block import Camera, parallel
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.time_curve import largest
 
 MARGIN = 0.86
 """Fraction of the picture's height and width that the motion fills."""
@@ -57,7 +58,7 @@ class PerspectiveCamera:
 def up_direction(scene: Scene) -> Array:
     """Unit vector that points up in pictures: the camera's ``up``, else against gravity, else z."""
     camera = _scene_camera(scene)
-    gravity = np.array(scene.gravity or (0.0, 0.0, 0.0))
+    gravity = np.zeros(3) + largest(scene.gravity)
     up = np.array(camera.up) if camera.up is not None else -gravity
     return _unit(up) if up.any() else np.array([0.0, 0.0, 1.0])
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array
 from lyra_petsc.output.file_operations import on_every_rank
 from lyra_petsc.output.read_run import StoredRun
+from lyra_petsc.scene.time_curve import TimeCurve
 from lyra_petsc.show.render.camera import CameraFit, up_direction
 from lyra_petsc.show.render.colour_quantities import PERCENTILES, ColourQuantity, quantity
 from lyra_petsc.show.render.image_files import contact_sheet, film_writer, half_size, write_png
@@ -107,10 +108,11 @@ def fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
     limits = (0.0, 1.0) if shown is None else shown.limits(values, plan.limits)
     wind = None
     if plan.options.wind and plan.scene.wind is not None:
-        wind = np.array(plan.scene.wind.velocity)
-        feet, arrow = wind_arrows(bounds, wind)
-        ends = np.concatenate([feet, feet + arrow])
-        support = np.maximum(support, (ends @ fit.normals.T).max(axis=0))
+        wind = TimeCurve.of(plan.scene.wind.velocity)
+        for velocity in filter(np.any, wind.values):
+            feet, arrow = wind_arrows(bounds, velocity)
+            ends = np.concatenate([feet, feet + arrow])
+            support = np.maximum(support, (ends @ fit.normals.T).max(axis=0))
     view = fit.view(support)
     return on_every_rank(
         comm, lambda: SceneDrawing(plan, view, bounds, shown, limits, wind, obstacles, floor)

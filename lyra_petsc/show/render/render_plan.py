@@ -17,6 +17,7 @@ from lyra_petsc.output.layout import SCENE_FILE
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.time_curve import acts
 from lyra_petsc.show.render.camera import line_of_sight, up_direction
 from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
 from lyra_petsc.show.render.image_files import (
@@ -170,7 +171,7 @@ def make_plan(options: RenderOptions) -> RenderPlan:
         if options.texture is not None:
             raise InputError("covers what --texture shows; leave one of them out", key="--field")
         quantity(run, options.field)
-    if options.wind and (scene.wind is None or not any(scene.wind.velocity)):
+    if options.wind and (scene.wind is None or not acts(scene.wind.velocity)):
         raise InputError("this run's scene has no wind to draw", key="--wind")
     if options.handles:
         if not scene.handles:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.scene.time_curve import TimeCurve
 from lyra_petsc.show.render.camera import PerspectiveCamera, horizon
 from lyra_petsc.show.render.colour_quantities import ColourQuantity, material_coordinates, round_numbers
 from lyra_petsc.show.render.opengl import import_pyvista, off_screen_plotter
@@ -122,8 +123,8 @@ class SceneDrawing:
         The quantity that colours the sheet.
     limits : (float, float)
         Range of the colours.
-    wind : (3,) float64 or None
-        Velocity of the wind [m/s], if it is drawn.
+    wind : TimeCurve or None
+        Velocity (3,) of the wind [m/s], if it is drawn.
     obstacles : list of ObstacleSurface
     floor : float
         Height of the floor [m].
@@ -140,7 +141,7 @@ class SceneDrawing:
         bounds: Bounds,
         quantity: ColourQuantity | None,
         limits: tuple[float, float],
-        wind: Array | None,
+        wind: TimeCurve | None,
         obstacles: list[ObstacleSurface],
         floor: float,
     ) -> None:
@@ -169,9 +170,12 @@ class SceneDrawing:
         self._held = HeldVertices(plan.run) if plan.options.handles else None
         if self._held is not None:
             self._add_handles()
+        self._wind = wind
         if wind is not None:
-            arrows = _arrow_mesh(pyvista, *wind_arrows(bounds, wind))
-            plotter.add_mesh(arrows, color=WIND_COLOR, ambient=0.35, reset_camera=False)
+            self._arrows = _arrow_mesh(pyvista, *wind_arrows(bounds, wind.largest))
+            self._arrows_actor = plotter.add_mesh(
+                self._arrows, color=WIND_COLOR, ambient=0.35, reset_camera=False
+            )
         self._time = self._add_text(" ", (18 * self._scale, 14 * self._scale), font="arial")
         digits = f"{{:.{decimals(plan.run.times)}f}}"
         static = plan.scene.time.static
@@ -219,7 +223,17 @@ class SceneDrawing:
             self._handles.points = self._rods.points = x
             self._handles.verts = np.column_stack([np.ones_like(single), single]).ravel()
             self._rods.lines = np.column_stack([np.full(len(edges), 2), edges]).ravel()
+        if self._wind is not None and len(self._wind.times) > 1:
+            self._show_wind(self._wind.at(time), self._wind.largest)
         self._time.input = self._label.format(time) if self._plan.options.label else ""
+
+    def _show_wind(self, velocity: Array, largest: Array) -> None:
+        """Draw arrows of a length in proportion to the wind's velocity (3,) [m/s]; none if it is calm."""
+        self._arrows_actor.visibility = bool(velocity.any())
+        if velocity.any():
+            feet, arrow = wind_arrows(self._bounds, velocity)
+            part = float(np.linalg.norm(velocity) / np.linalg.norm(largest))
+            self._arrows.points = _arrow_mesh(self._pyvista, feet, part * arrow).points
 
     def close(self) -> None:
         """Close the windows."""

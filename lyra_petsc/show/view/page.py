@@ -20,6 +20,7 @@ from vtkmodules.vtkRenderingCore import vtkCellPicker
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.parallel import ALONE
+from lyra_petsc.scene.time_curve import acts
 from lyra_petsc.show.render.colour_quantities import quantity, quantity_names
 from lyra_petsc.show.render.draw import fitted_drawing
 from lyra_petsc.show.render.render_plan import FEW_STATES, RenderOptions, make_plan, spread_states
@@ -77,7 +78,7 @@ class RunPage:
             field=self._first_field,
             range=range,
             handles=bool(run.scene.handles),
-            wind=wind is not None and any(wind.velocity),
+            wind=wind is not None and acts(wind.velocity),
             ground=False,
             settings=settings,
             fitted_states=FEW_STATES,

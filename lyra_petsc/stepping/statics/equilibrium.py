@@ -122,9 +122,7 @@ class Equilibrium:
             factors=stepper.solver.linear.factors,
         )
         self._follows = bool(equations.active.viscous or equations.active.following)
-        equations.take_loads(factor=0.0)
-        equations.begin_step(0.0, 0.0)
-        force = equations.out_of_balance()
+        force = start_force(equations)
         self._balance.scale = self._balance.norm(force)
         # if the sheet slides, forces that hold its start shape would push it along
         held = not equations.near
@@ -167,7 +165,6 @@ class Equilibrium:
         """Find the equilibrium by Newton's method with the whole stiffness; collective."""
         if self._whole_stiffness is None:
             return None
-        self._equations.take_loads(factor=factor)
         guess = self._prediction.extrapolated(before, factor)
         attempt = self._whole_stiffness.find(before, factor, guess)
         if attempt is not None:
@@ -178,7 +175,6 @@ class Equilibrium:
         """Find the equilibrium as described at the top of the module; collective."""
         equations, friction = self._equations, self._friction
         x = equations.x[: equations.points.n_owned].copy()
-        equations.take_loads(factor=factor)
         progress, relaxation = LoadStepProgress(before, factor, x), Relaxation(equations.points.comm)
         judges_energy = equations.contact is not None and self._is_held()
         self._integrator.predicted = self._prediction.extrapolated(before, factor) - x
@@ -411,6 +407,13 @@ class Equilibrium:
         self._in_vain = 0
         self._balance.record()
         self._prediction.record(factor)
+
+
+def start_force(equations: StageEquations) -> Array:
+    """Force (n_owned, 3) [N] of the start shape on its free unknowns, without loads; collective."""
+    equations.begin_step(0.0, 0.0)
+    loads = np.where(equations.step.prescribed.free, equations.step.loads.force, 0.0)
+    return equations.out_of_balance() - loads
 
 
 def _failed_solve(equations: StageEquations, progress: LoadStepProgress) -> FailedSolve:

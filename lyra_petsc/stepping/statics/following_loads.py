@@ -79,8 +79,6 @@ class FollowingLoads:
         The shape [m].
     force_of : callable
         Adds the force [N] of a load at positions to an array.
-    factor : float
-        Load factor.
     """
 
     def __init__(
@@ -88,13 +86,12 @@ class FollowingLoads:
         loads: Sequence[Term],
         x: Array,
         force_of: Callable[[Any, Array, Array], None],
-        factor: float,
     ) -> None:
         self._from = x.copy()
         self._parts = []
         for load in loads:
             symmetric, skew = following_stiffness(load, x, force_of)
-            self._parts.append((load.stencil, factor * symmetric, factor * skew, load.n_owned))
+            self._parts.append((load.stencil, symmetric, skew, load.n_owned))
 
     def _forces(self, x: Array) -> Iterator[tuple[NDArray[np.int32], Array, Array, int]]:
         """Stencil, u (E, n, 3) [m], K u (E, n, 3) [N] and number of owned elements of each load."""

@@ -20,7 +20,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.following_loads import FollowingLoads
 from lyra_petsc.stepping.statics.rigid_motions import rigid_motions
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.term import Load, UpcomingStep, Viscous
+from lyra_petsc.terms.term import Load, Viscous
 
 MAX_VERTICES = 200_000
 """Number of vertices above which no factors are computed."""
@@ -85,18 +85,16 @@ def add_exact_hessian(equations: StageEquations, values: Array) -> FollowingLoad
 
     def force_of(term: Load | Viscous, x: Array, out: Array) -> None:
         """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""
+        step = equations.targets_at(equations.step.end, x)
         if isinstance(term, Load):
-            term.add_force_on_vertices(x, equations.step.start, equations.step.end, out)
+            term.add_force_on_vertices(step, out)
         else:
             against = np.zeros_like(out)
-            step = UpcomingStep(
-                equations.step.start, equations.step.end, equations.step.end, x, equations.reference.at
-            )
             term.add_gradient(np.zeros_like(x), term.freeze(step), against)
             out -= against
 
     following = [*active.following, *active.viscous]
-    loads = FollowingLoads(following, equations.x, force_of, equations.load_case.factor)
+    loads = FollowingLoads(following, equations.x, force_of)
     loads.add_hessian(1.0, rows.pattern, values)
     return loads
 

@@ -16,7 +16,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.following_loads import FollowingLoads, Solve, newton_displacement
 from lyra_petsc.stepping.statics.stability import Examination, Stability
 from lyra_petsc.stepping.stepper import Attempt
-from lyra_petsc.terms.term import Load
+from lyra_petsc.terms.term import Load, UpcomingStep
 
 MAX_ITERATIONS, MAX_GROWTH = 20, 1e6
 """Limits of Newton's method: iterations, and growth of the force in one of them, by stretching."""
@@ -127,9 +127,10 @@ class WholeStiffness:
         """The loads that follow the shape, linear in the displacement from it."""
 
         def force_of(load: Load, x: Array, out: Array) -> None:
-            load.add_force_on_vertices(x, before, factor, out)
+            step = UpcomingStep(before, factor, factor, x, self._equations.reference.at)
+            load.add_force_on_vertices(step, out)
 
-        return FollowingLoads(self._equations.active.following, self._equations.x, force_of, factor)
+        return FollowingLoads(self._equations.active.following, self._equations.x, force_of)
 
     def skew_force(self, loads: FollowingLoads, u: Array) -> Array:
         """Force (n_owned, 3) [N] of the skew part on free unknowns for a displacement (n_owned, 3) [m];

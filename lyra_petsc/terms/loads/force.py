@@ -9,17 +9,15 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import find_group, select_triangles, select_vertices
 from lyra_petsc.scene.schema import AppliedLoad, Scene
-from lyra_petsc.terms.handles.motion import Window
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import WindowedLoad
+from lyra_petsc.terms.term import UpcomingStep, WindowedLoad
 
 
 class Force(WindowedLoad):
-    """Forces and tractions of all loads: stencil (E, 1), data ``force`` (E, 3) [N]."""
+    """Forces and tractions of all loads: stencil (E, 1), data ``share`` (E,), of a force, or area [m²]."""
 
-    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        force = self.elements.data["force"] * self.strength(t0, t1)[:, None]
-        np.add.at(out, self.stencil[:, 0], force)
+    def add_force(self, step: UpcomingStep, out: Array) -> None:
+        np.add.at(out, self.stencil[:, 0], self.elements.data["share"][:, None] * self.values(step))
 
 
 def _shares(rest: RestShape, load: AppliedLoad, key: str) -> tuple[NDArray[np.int64], Array]:
@@ -45,12 +43,11 @@ def _shares(rest: RestShape, load: AppliedLoad, key: str) -> tuple[NDArray[np.in
 
 
 def elements(rest: RestShape) -> Elements:
-    """Nodal forces of all force and traction loads (rank 0)."""
-    vertices, forces, loads = [], [], []
+    """Vertices of all force and traction loads, and their shares (rank 0)."""
+    vertices, shares, loads = [], [], []
     for number, load in enumerate(rest.scene.loads):
         if load.force is not None:
             chosen, share = _shares(rest, load, f"loads[{number}]")
-            force = share[:, None] * np.asarray(load.force)
         elif load.traction is not None:
             faces = select_triangles(
                 rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source
@@ -59,16 +56,16 @@ def elements(rest: RestShape) -> Elements:
                 rest.mesh.triangles[faces].ravel(), np.repeat(rest.area[faces] / 3.0, 3), rest.mesh.n_vertices
             )
             chosen = np.flatnonzero(area)
-            force = area[chosen, None] * np.asarray(load.traction)
+            share = np.asarray(area[chosen], dtype=np.float64)
         else:
             continue
         vertices.append(chosen)
-        forces.append(force)
+        shares.append(share)
         loads.append(np.full(len(chosen), float(number)))
     stencil = np.concatenate(vertices)[:, None]
-    return Elements(stencil, {"force": np.concatenate(forces), "load": np.concatenate(loads)})
+    return Elements(stencil, {"share": np.concatenate(shares), "load": np.concatenate(loads)})
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Force:
     """The load on one rank."""
-    return Force(elements, [Window(load.start, load.until) for load in scene.loads])
+    return Force(elements, scene, "force", "traction")

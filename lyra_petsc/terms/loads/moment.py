@@ -20,15 +20,14 @@ from lyra_petsc.mesh.topology import boundary_edges
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.bending.midedge_shape import unit
-from lyra_petsc.terms.handles.motion import Window
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Term, WindowedLoad
+from lyra_petsc.terms.term import Term, UpcomingStep, WindowedLoad
 
 
 class Moment(WindowedLoad):
-    """The moments of all loads: stencil (E, 2), edges (E, 1), data ``moment`` (E,) [N·m/m].
+    """The moments of all loads: stencil (E, 2), edges (E, 1), data ``sign`` (E,).
 
-    A moment is about its edge, directed from the smaller vertex number.
+    A moment [N·m/m] times its sign is about its edge, directed from the smaller vertex number.
     """
 
     is_follower = True
@@ -39,13 +38,12 @@ class Moment(WindowedLoad):
         self._indices = self.edges[:, 0]
         self._numbers = np.searchsorted(term.of_edges.indices, self._indices)
 
-    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        moment = self.elements.data["moment"] * self.strength(t0, t1)
-        np.add.at(out.reshape(-1), self._indices, moment)
-        self._add_couples(x, moment, out)
+    def add_force(self, step: UpcomingStep, out: Array) -> None:
+        np.add.at(out.reshape(-1), self._indices, self.elements.data["sign"] * self.values(step))
+        self.add_force_on_vertices(step, out)
 
-    def add_force_on_vertices(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        self._add_couples(x, self.elements.data["moment"] * self.strength(t0, t1), out)
+    def add_force_on_vertices(self, step: UpcomingStep, out: Array) -> None:
+        self._add_couples(step.x, self.elements.data["sign"] * self.values(step), out)
 
     def _add_couples(self, x: Array, moment: Array, out: Array) -> None:
         """Add the forces ± M L γ [N] to out."""
@@ -73,7 +71,7 @@ def elements(rest: RestShape) -> Elements:
     low, high = ends.min(axis=1), ends.max(axis=1)
     keys, sign = low * n + high, np.where(ends[:, 0] < ends[:, 1], -1.0, 1.0)
     number = np.searchsorted(rest.edges[:, 0] * n + rest.edges[:, 1], keys)
-    rows, moments, loads = [], [], []
+    rows, signs, loads = [], [], []
     for index, load in enumerate(scene.loads):
         if load.moment is None:
             continue
@@ -102,13 +100,13 @@ def elements(rest: RestShape) -> Elements:
                 key=f"{key}.moment",
             )
         rows.append(row)
-        moments.append(load.moment * sign[row])
+        signs.append(sign[row])
         loads.append(np.full(len(row), float(index)))
     row = np.concatenate(rows)
-    data = {"moment": np.concatenate(moments), "load": np.concatenate(loads)}
+    data = {"sign": np.concatenate(signs), "load": np.concatenate(loads)}
     return Elements(np.column_stack([low[row], high[row]]), data, edges=number[row][:, None])
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Moment:
     """The load on one rank."""
-    return Moment(elements, [Window(load.start, load.until) for load in scene.loads])
+    return Moment(elements, scene, "moment")

@@ -15,9 +15,9 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_triangles
 from lyra_petsc.mesh.topology import connected_pieces, enclosed_volumes
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.handles.motion import Window
+from lyra_petsc.scene.time_curve import largest
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import WindowedLoad
+from lyra_petsc.terms.term import UpcomingStep, WindowedLoad
 
 
 @kernel()
@@ -33,17 +33,17 @@ def add_force(x, s, pressure, out):  # type: ignore[no-untyped-def]
 
 
 class Pressure(WindowedLoad):
-    """The pressures of all loads: stencil (E, 3), data ``pressure`` (E,) [Pa]."""
+    """The pressures of all loads: stencil (E, 3)."""
 
     is_follower = True
 
-    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        add_force(x, self.stencil, self.elements.data["pressure"] * self.strength(t0, t1), out)
+    def add_force(self, step: UpcomingStep, out: Array) -> None:
+        add_force(step.x, self.stencil, self.values(step), out)
 
 
 def elements(rest: RestShape) -> Elements:
     """The triangles under each pressure load (rank 0)."""
-    stencils, pressures, loads = [], [], []
+    stencils, loads = [], []
     for number, load in enumerate(rest.scene.loads):
         if load.pressure is not None:
             chosen = select_triangles(
@@ -51,19 +51,18 @@ def elements(rest: RestShape) -> Elements:
             )
             triangles = rest.mesh.triangles[chosen]
             volumes = enclosed_volumes(rest.mesh.positions, triangles, connected_pieces(triangles))
-            if load.pressure and volumes.min(initial=0.0) < 0.0:
-                effect = "compress" if load.pressure > 0.0 else "inflate"
+            pressure = largest(load.pressure)
+            if pressure and volumes.min(initial=0.0) < 0.0:
+                effect = "compress" if pressure > 0.0 else "inflate"
                 rest.notes.append(
                     f"loads[{number}].pressure: the normals of a closed surface point inwards, so that "
-                    f"{load.pressure:g} Pa {effect} it; {-load.pressure:g} would do the opposite"
+                    f"{pressure:g} Pa {effect} it; {-pressure:g} would do the opposite"
                 )
             stencils.append(triangles)
-            pressures.append(np.full(len(chosen), load.pressure))
             loads.append(np.full(len(chosen), float(number)))
-    data = {"pressure": np.concatenate(pressures), "load": np.concatenate(loads)}
-    return Elements(np.concatenate(stencils), data)
+    return Elements(np.concatenate(stencils), {"load": np.concatenate(loads)})
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Pressure:
     """The load on one rank."""
-    return Pressure(elements, [Window(load.start, load.until) for load in scene.loads])
+    return Pressure(elements, scene, "pressure")

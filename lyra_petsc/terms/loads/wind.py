@@ -13,6 +13,7 @@ hence the implicit force is stable for any wind and step length.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from lyra_petsc.kernels.vector3 import area_normal, dot, scaled
 from lyra_petsc.kernels.vectors import add_outers
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.time_curve import TimeCurve, is_curve
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Offsets, UpcomingStep, Viscous
 
@@ -95,6 +97,18 @@ def add_hessian(v, s, area, n, wind, density, drag, offsets, values):  # type: i
             add_outers(values, offsets[e, pair], across, ((left, right),))
 
 
+class Air(NamedTuple):
+    """The air in a step, and the sheet's unit normals (E, 3).
+
+    ``velocity`` (3,) [m/s], ``density`` [kg/m³], ``drag`` [kg/(m² s)].
+    """
+
+    normals: Array
+    velocity: Array
+    density: float
+    drag: float
+
+
 class Wind(Viscous):
     """Wind on all triangles.
 
@@ -102,34 +116,33 @@ class Wind(Viscous):
     ----------
     elements : Elements
         Stencil (E, 3); data ``area`` (E,) [m²].
-    velocity : (3,) [m/s]
-    density : float
-        [kg/m³]
-    drag : float
-        [kg/(m² s)]
+    velocity : TimeCurve
+        (3,) [m/s].
+    density, drag : TimeCurve
+        [kg/m³], [kg/(m² s)].
     """
 
-    def __init__(self, elements: Elements, velocity: Array, density: float, drag: float) -> None:
+    def __init__(self, elements: Elements, velocity: TimeCurve, density: TimeCurve, drag: TimeCurve) -> None:
         super().__init__(elements)
         self._area = elements.data["area"]
-        self._law = (np.asarray(velocity, dtype=np.float64), float(density), float(drag))
+        self._velocity, self._density, self._drag = velocity, density, drag
+        self.varies = velocity.varies
 
-    def freeze(self, step: UpcomingStep) -> Array:
-        """Unit normals (E, 3)."""
-        out = np.empty((self.n_elements, 3))
+    def freeze(self, step: UpcomingStep) -> Air:
+        out, time = np.empty((self.n_elements, 3)), step.target_time
         normals(step.x, self.stencil, out)
-        return out
+        return Air(out, self._velocity.at(time), float(self._density.at(time)), float(self._drag.at(time)))
 
-    def potentials(self, v: Array, frozen: Array) -> Array:
+    def potentials(self, v: Array, frozen: Air) -> Array:
         out = np.empty(self.n_owned)
-        potentials(v, self.stencil, self._area, frozen, *self._law, out)
+        potentials(v, self.stencil, self._area, *frozen, out)
         return out
 
-    def add_gradient(self, v: Array, frozen: Array, out: Array) -> None:
-        add_gradient(v, self.stencil, self._area, frozen, *self._law, out)
+    def add_gradient(self, v: Array, frozen: Air, out: Array) -> None:
+        add_gradient(v, self.stencil, self._area, *frozen, out)
 
-    def add_hessian(self, v: Array, frozen: Array, offsets: Mapping[str, Offsets], values: Array) -> None:
-        add_hessian(v, self.stencil, self._area, frozen, *self._law, offsets[self.name], values)
+    def add_hessian(self, v: Array, frozen: Air, offsets: Mapping[str, Offsets], values: Array) -> None:
+        add_hessian(v, self.stencil, self._area, *frozen, offsets[self.name], values)
 
 
 def elements(rest: RestShape) -> Elements:
@@ -138,6 +151,8 @@ def elements(rest: RestShape) -> Elements:
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Wind:
-    """The term on one rank."""
+    """The term on one rank; in a static analysis the force of a constant wind grows with the load factor."""
     assert scene.wind is not None
-    return Wind(elements, np.array(scene.wind.velocity), scene.wind.density, scene.wind.drag)
+    wind, grows = scene.wind, scene.time.static and not is_curve(scene.wind.velocity)
+    law = [TimeCurve.of(value, grows=grows) for value in (wind.density, wind.drag)]
+    return Wind(elements, TimeCurve.of(wind.velocity), *law)

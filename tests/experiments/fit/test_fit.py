@@ -41,6 +41,13 @@ BENDING_KEY = ["material.bending"]
 BENDING = {"material.bending": {"start": 2e-5, "bounds": [1e-6, 1e-3]}}
 
 
+RAMP: dict[str, Any] = {
+    "loads": [
+        {"nodes": [17], "force": [[0.0, [0, 0, 0]], [0.3, [0, 0, 2e-4]], [1.0, [0, 0, 5e-5]]]},
+    ]
+}
+
+
 def strip(*measurements: dict[str, Any], parameters: Any = BENDING, **more: Any) -> dict[str, Any]:
     return STRIP | more | {"fit": {"parameters": parameters, "measurements": list(measurements)}}
 
@@ -61,6 +68,22 @@ def test_values_and_gradients() -> None:
     assert force.value[2] == pytest.approx(weight, rel=1e-4)
     assert force.derivatives["material.density"][2] * 0.15 == pytest.approx(force.value[2], rel=1e-5)
     assert abs(force.derivatives["material.bending"][2]) * TRUE < 1e-6 * weight
+
+
+@pytest.mark.parametrize("time", [{"analysis": "static"}, {"end": 0.04, "step": 0.002, "integrator": "bdf2"}])
+def test_gradient_by_a_value_of_a_curve(time: dict[str, Any]) -> None:
+    static, key = (
+        "analysis" in time,
+        "loads[0].force[1][1][2]" if "end" in time else "loads[0].force[2][1][2]",
+    )
+    scene, tip = STRIP | RAMP | {"time": time}, {"probe": "tip", "axes": ["z"]}
+    gradient = lyra_petsc.gradient(scene, tip, [key])
+    step, values = 1e-6, []
+    for sign in (1.0, -1.0):
+        changed = lyra_petsc.load(scene).changed({key: (5e-5 if static else 2e-4) + sign * step})
+        values.append(lyra_petsc.gradient(changed, tip, [key]).value[0])
+    assert gradient.derivatives[key][0] == pytest.approx((values[0] - values[1]) / (2.0 * step), rel=1e-3)
+    assert abs(gradient.derivatives[key][0]) > 1.0
 
 
 @pytest.mark.parametrize("kind", ["probe", "overhang", "points"])
@@ -255,6 +278,14 @@ def test_invalid_fits_are_refused(change: dict[str, Any], words: str, tmp_path: 
         (STRIP, "tip", {"material.bending": "1"}, "parameters.material.bending: must be a number"),
         (STRIP, "tip", {"material.bending": -1.0}, "must be >= 0"),
         (STRIP, "tip", [*BENDING_KEY, "material[0].bending"], "is the number material.bending"),
+        (
+            STRIP | RAMP,
+            "tip",
+            ["loads[0].force[1][0]"],
+            "only those of a curve can be varied, as in loads[0]",
+        ),
+        (STRIP | RAMP, "tip", ["loads[0].force[1]"], "is no value of a point"),
+        (STRIP | RAMP, "tip", ["gravity[1][1][2]"], "is no number that the scene gives"),
     ],
 )
 def test_invalid_gradients_are_refused(scene: Any, quantity: Any, parameters: Any, words: str) -> None:
