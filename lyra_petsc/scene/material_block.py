@@ -23,6 +23,7 @@ from lyra_petsc.scene.values import (
     NonNegative,
     Number,
     Pair,
+    PartBelowOne,
     Poisson,
     Positive,
     StretchRatio,
@@ -260,6 +261,13 @@ class Material(Block):
     stretch_limit : float or None
         Largest ratio of a length in the sheet to that at rest, in every direction, which no step exceeds:
         1.05 lets it stretch by up to 5 %. From half of that on the sheet resists more and more.
+    yield_curvature : float [1/m] or None
+        Curvature from which on a strip of the material bends plastically and keeps a fold: 2 σ / (E h) for
+        yield stress σ, Young's modulus E and thickness h. Divided by ``thicken``. Without it bending is
+        elastic.
+    hardening : float
+        Stiffness in plastic bending over the elastic one, below 1 (kinematic hardening: the elastic range of
+        moments keeps its width); 0 is perfectly plastic. Needs ``yield_curvature``.
     """
 
     conditional_defaults = frozenset({"bending_model"})
@@ -285,6 +293,8 @@ class Material(Block):
     friction_force: NonNegative | None = None
     kes: KesReport | None = None
     stretch_limit: StretchRatio | None = None
+    yield_curvature: Positive | None = None
+    hardening: PartBelowOne = 0.0
 
     @classmethod
     def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
@@ -341,6 +351,8 @@ class Material(Block):
                 "with hinges it depends on the mesh",
                 "bending_model",
             )
+        text = "is of plastic bending, which begins at yield_curvature; give that, too"
+        require(self.yield_curvature is not None or self.hardening == 0.0, text, "hardening")
         if self.law == "measured":
             other = "" if self.cloth is None else f"; {self.cloth} is none of them, leave law out"
             text = f"measured is for measured cloths: {', '.join(measured_names())}{other}"

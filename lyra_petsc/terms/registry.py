@@ -111,6 +111,16 @@ def _has_bending_friction(scene: Scene, shells: Sequence[ShellMaterial]) -> bool
     return any(max(shell.friction_moment) > 0.0 for shell in shells)
 
 
+def _yields_by(model: str) -> Need:
+    return lambda scene, shells: any(
+        shell.bends_with(model) and math.isfinite(shell.yield_curvature) for shell in shells
+    )
+
+
+def _has_yielding_clamps(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
+    return _has_clamped_hinges(scene, shells) and _yields_by("hinge")(scene, shells)
+
+
 REGISTRY: list[Registration] = [
     Registration("membrane", lambda scene, shells: True, Role.ELASTIC, MEMBRANE, damped=True),
     Registration(
@@ -139,6 +149,25 @@ REGISTRY: list[Registration] = [
         BENDING,
         coarse="bending",
         module_name=".bending.midedge_friction",
+    ),
+    Registration(
+        "hinge_plasticity",
+        _yields_by("hinge"),
+        Role.ELASTIC,
+        BENDING,
+        damped=True,
+        bends=True,
+        module_name=".bending.hinge_plasticity",
+    ),
+    Registration(
+        "midedge_plasticity",
+        _yields_by("midedge"),
+        Role.ELASTIC,
+        BENDING,
+        damped=True,
+        bends=True,
+        coarse="bending",
+        module_name=".bending.midedge_plasticity",
     ),
     Registration(
         "shear_friction",
@@ -183,6 +212,15 @@ REGISTRY: list[Registration] = [
         lambda scene, shells: any(load.chamber for load in scene.loads),
         Role.ELASTIC,
         "gas_energy",
+    ),
+    Registration(
+        "clamp_plasticity",
+        _has_yielding_clamps,
+        Role.ELASTIC,
+        BENDING,
+        damped=True,
+        bends=True,
+        module_name=".bending.clamp_plasticity",
     ),
     Registration(
         "spring",

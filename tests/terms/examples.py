@@ -19,6 +19,14 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
     "bending": {},
     "midedge": {"material": BENDING | {"bending_model": "midedge"}},
     "midedge_friction": {"material": BENDING | {"friction_moment": [3.0e-3, 1.0e-3]}},
+    "hinge_plasticity": {"material": BENDING | {"yield_curvature": 0.8, "hardening": 0.2}},
+    "midedge_plasticity": {
+        "material": BENDING | {"bending_model": "midedge", "yield_curvature": 0.8, "hardening": 0.2}
+    },
+    "clamp_plasticity": {
+        "material": BENDING | {"yield_curvature": 0.8, "hardening": 0.2},
+        "handles": [{"nodes": [0, 1, 2, 3], "clamp": True}],
+    },
     "stretch_limit": {"material": BENDING | {"stretch_limit": 1.8}},
     "shear_friction": {"material": BENDING | {"friction_force": 2.0}},
     "clamp": {"handles": [{"nodes": [0, 1, 2, 3], "clamp": True}]},

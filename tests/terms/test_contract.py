@@ -32,7 +32,7 @@ pytestmark = pytest.mark.quick
 
 
 #: terms with targets in space: not invariant under rigid motions, and their forces do not sum to zero
-ANCHORED = {"clamp", "spring"}
+ANCHORED = {"clamp", "clamp_plasticity", "spring"}
 
 #: terms with forces in the start shape (test_chambers.py)
 FILLED = {"chambers"}

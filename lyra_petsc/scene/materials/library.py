@@ -36,6 +36,10 @@ ISOTROPIC_LIBRARIES = ("engineering.json",)
 # would stretch along one direction without force.
 PROJECTION_FLOOR = 0.01
 
+# Smallest stiffness in plastic bending over the elastic one: with none a fold would open without a
+# moment, and terms without stiffness have no scale.
+MIN_HARDENING = 1e-6
+
 Triple = tuple[float, float, float]
 Plate = tuple[float, float, float, float]
 
@@ -79,6 +83,10 @@ class ShellMaterial:
         Force [N/m] of internal friction against shear.
     stretch_limit : float
         Upper bound of the principal stretches; infinite without a limit.
+    yield_curvature : float
+        Curvature [1/m] at which a strip begins to bend plastically; infinite if it never does.
+    hardening : float
+        Stiffness in plastic bending over the elastic one.
     """
 
     density: float
@@ -99,6 +107,19 @@ class ShellMaterial:
     friction_moment: tuple[float, float] = (0.0, 0.0)
     friction_force: float = 0.0
     stretch_limit: float = math.inf
+    yield_curvature: float = math.inf
+    hardening: float = 0.0
+
+    @property
+    def elastic_share(self) -> float:
+        """Fraction of the bending stiffness that never yields."""
+        return 1.0 if math.isinf(self.yield_curvature) else max(self.hardening, MIN_HARDENING)
+
+    @property
+    def strip_stiffness(self) -> float:
+        """Moment per width over curvature [N·m] of a strip along the warp with free edges, by ``plate``."""
+        d11, d12, d22, _ = self.plate
+        return d11 - d12 * d12 / d22
 
     @property
     def plate_matrix(self) -> tuple[Triple, Triple, Triple]:
@@ -234,12 +255,18 @@ def resolve_material(
     shell = _scaled(_with_friction(shell, material), material)
     if material.stretch_limit is not None:
         shell = replace(shell, stretch_limit=material.stretch_limit)
-    if max(shell.friction_moment) > 0.0 and not shell.bends_with(shell.model):
-        raise InputError(
-            "friction needs a bending stiffness; give bending, too",
-            file=file,
-            key=f"{key}.friction_moment",
-        )
+    if material.yield_curvature is not None:
+        # a fibre yields at a strain, which is half the thickness times the curvature
+        curvature = material.yield_curvature / material.thicken
+        shell = replace(shell, yield_curvature=curvature, hardening=material.hardening)
+    for present, name in (
+        (max(shell.friction_moment) > 0.0, "friction_moment"),
+        (math.isfinite(shell.yield_curvature), "yield_curvature"),
+    ):
+        if present and not shell.bends_with(shell.model):
+            raise InputError(
+                f"{name} needs a bending stiffness; give bending, too", file=file, key=f"{key}.{name}"
+            )
     numbers = (shell.density, shell.c11, shell.c12, shell.c22, shell.c33, *shell.bending, *shell.plate)
     frictions = *shell.friction_moment, shell.friction_force
     if not all(math.isfinite(value) for value in (*numbers, *frictions)):

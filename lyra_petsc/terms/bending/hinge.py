@@ -11,6 +11,7 @@ The energy of a hinge fades out if a triangle's area is below a tenth of its res
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -113,28 +114,35 @@ class Bending(HasGeometry):
     def energies(self, x: Array, frozen: Located | None = None) -> Array:
         return self.all_energies(x, frozen, self.n_owned)
 
+    def law(self, angles: Array, convexity: float | None = None) -> tuple[Array, Array]:
+        """k (E,) [N·m] and θ̄ (E,) [rad] of hinges at ``angles`` (E,): energies and moments there are those of
+        k (θ − θ̄)²; with ``convexity`` moments and their derivatives are, mixed as Hessians are.
+        """
+        return self._k, self._rest
+
     def all_energies(self, x: Array, frozen: Located | None, n: int) -> Array:
         """Energy [J] of the first n hinges of this rank, (n,)."""
         geometry = self._geometry(x, frozen)
-        out = self._k[:n] * (geometry.angles[:n] - self._rest[:n]) ** 2
+        law = self.law(geometry.angles)
+        out = law[0][:n] * (geometry.angles[:n] - law[1][:n]) ** 2
         if len(geometry.fading):
-            hinge_fading.energies(x, *self._fading(geometry), out)
+            hinge_fading.energies(x, *self._fading(geometry, law), out)
         return out
 
-    def _fading(self, geometry: HingeGeometry) -> tuple[Array | Stencil, ...]:
+    def _fading(self, geometry: HingeGeometry, law: tuple[Array, Array]) -> tuple[Array | Stencil, ...]:
         """Arguments of the functions of ``hinge_fading`` about the hinges and their law."""
         hinges = self.stencil, self._triangles.sides, geometry.fading
-        return *hinges, self._limit, geometry.angles, self._k, self._rest
+        return *hinges, self._limit, geometry.angles, *law
 
     def add_gradient(self, x: Array, frozen: Located | None, out: Array) -> None:
         corners, sides, hinges = self._triangles
         geometry = self._geometry(x, frozen)
         triangles, angles, lengths, fading = geometry
-        forces = np.empty(self.n_elements + 1)
-        hinge_forces.edge_forces(sides, triangles, angles, lengths, self._k, self._rest, forces)
+        law, forces = self.law(angles), np.empty(self.n_elements + 1)
+        hinge_forces.edge_forces(sides, triangles, angles, lengths, *law, forces)
         hinge_forces.add_gradient(corners, hinges, triangles, forces, out)
         if len(fading):
-            hinge_fading.add_gradient(x, *self._fading(geometry), out)
+            hinge_fading.add_gradient(x, *self._fading(geometry, law), out)
 
     @property
     def couplings(self) -> Couplings:
@@ -146,12 +154,13 @@ class Bending(HasGeometry):
         geometry, convexity = self._geometry(x, frozen), into.convexity
         triangles, angles, lengths, fading = geometry
         factors = np.empty((self.n_elements + 1, 2))
-        law, values = (convexity, self._k, self._rest, into.weight), into.values
-        add_across(sides, triangles, angles, lengths, *law, across, values, factors)
+        law, values = self.law(angles, convexity), into.values
+        weighted = convexity, *law, into.weight
+        add_across(sides, triangles, angles, lengths, *weighted, across, values, factors)
         add_within(x, corners, hinges, sides, triangles, factors, within, values)
         if len(fading):
             to = into.weight, within, across, values
-            hinge_fading.add_hessian(x, *self._fading(geometry), convexity, *to)
+            hinge_fading.add_hessian(x, *self._fading(geometry, law), convexity, *to)
 
     def force_scale(self, size: float) -> Array:
         return self.elements.data["k"] * size / self.elements.data["rest_height"] ** 2
@@ -256,11 +265,12 @@ def mirrored_angles(rest: RestShape, corners: NDArray[np.int64], triangle: NDArr
     return -0.5 * (ee * along * (along - np.linalg.norm(edge, axis=1)) + nn * height**2) / height
 
 
-def elements(rest: RestShape, model: str = "hinge") -> Elements:
-    """All interior edges between materials of this bending model, with their constants (rank 0).
+def whole_hinges(rest: RestShape, model: str = "hinge") -> tuple[Elements, NDArray[np.int64]]:
+    """All interior edges between materials of this bending model with the constants of elastic bending, and
+    the triangle (E,) of which each has the material (rank 0).
 
-    Between two materials the smaller B is taken, as in the original Lyra. The rest length is the mean over
-    the two triangles, which differ at a seam.
+    Between two materials that of smaller B is taken, as in the original Lyra. The rest length is the mean
+    over the two triangles, which differ at a seam.
     """
     quad, faces = rest.hinges.vertices, rest.hinges.triangles
     edges, stiffnesses = zip(
@@ -288,7 +298,15 @@ def elements(rest: RestShape, model: str = "hinge") -> Elements:
         ),
         "damping": damping,
     }
-    return Elements(quad[bends], {name: values[bends] for name, values in data.items()})
+    softer = np.where(stiffnesses[0] <= stiffnesses[1], faces[:, 0], faces[:, 1])
+    return Elements(quad[bends], {name: values[bends] for name, values in data.items()}), softer[bends]
+
+
+def elements(rest: RestShape, model: str = "hinge") -> Elements:
+    """Those of `whole_hinges` with the part of their stiffness that never yields (rank 0)."""
+    hinges, triangle = whole_hinges(rest, model)
+    k = hinges.data["k"] * rest.per_triangle("elastic_share")[triangle]
+    return replace(hinges, data={**hinges.data, "k": k})
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Bending:

@@ -12,6 +12,7 @@ velocity of the mirror image.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -123,7 +124,7 @@ class Clamp(FollowsHandles, MovingTargets):
         super().__init__(elements)
         self._handle = elements.data["handle"].astype(np.int64)
         self._handles = handles
-        self._rest, self._limit = elements.data["rest_angle"], elements.data["limit"]
+        self._limit = elements.data["limit"]
 
     @property
     def reference_rows(self) -> NDArray[np.int64]:
@@ -141,23 +142,28 @@ class Clamp(FollowsHandles, MovingTargets):
             mirror[mine] = motion.moved(_mirrored(tail, head, opposite), window.start, step.target_time)
         return Mirrors(mirror, k)
 
+    def law(self, x: Array, frozen: Mirrors, convexity: float | None = None) -> tuple[Array, Array]:
+        """k (E,) and φ̄ (E,) of the half hinges at positions x, as `Bending.law`."""
+        return frozen.k, self.elements.data["rest_angle"]
+
     def energies(self, x: Array, frozen: Mirrors) -> Array:
         out = np.empty(self.n_owned)
-        energies(x, self.stencil, frozen.mirror, frozen.k, self._rest, self._limit, out)
+        energies(x, self.stencil, frozen.mirror, *self.law(x, frozen), self._limit, out)
         return np.where(frozen.k[: self.n_owned] > 0.0, out, 0.0)
 
     def add_gradient(self, x: Array, frozen: Mirrors, out: Array) -> None:
-        held = frozen.k > 0.0
-        constants = frozen.mirror[held], frozen.k[held], self._rest[held], self._limit[held]
+        held, (k, rest) = frozen.k > 0.0, self.law(x, frozen)
+        constants = frozen.mirror[held], k[held], rest[held], self._limit[held]
         add_gradient(x, self.stencil[held], *constants, out)
 
     def hessians(self, x: Array, frozen: Mirrors, lo: int, hi: int, convexity: float, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, convexity, frozen.mirror, frozen.k, self._rest, self._limit, out)
+        law = self.law(x, frozen, convexity)
+        hessians(x, self.stencil, lo, hi, convexity, frozen.mirror, *law, self._limit, out)
         out[frozen.k[lo:hi] == 0.0] = 0.0
 
     def targets(self, x: Array, frozen: Mirrors) -> tuple[Array, Array]:
         out = np.empty((self.n_owned, 3))
-        mirror_gradients(x, self.stencil, frozen.mirror, frozen.k, self._rest, self._limit, out)
+        mirror_gradients(x, self.stencil, frozen.mirror, *self.law(x, frozen), self._limit, out)
         out[frozen.k[: self.n_owned] == 0.0] = 0.0
         return frozen.mirror[: self.n_owned], out
 
@@ -166,8 +172,10 @@ class Clamp(FollowsHandles, MovingTargets):
         return self.elements.data["k"] * size / self.elements.data["height"] ** 2
 
 
-def elements(rest: RestShape) -> Elements:
-    """The boundary edges whose two ends are held by a handle with ``clamp`` (rank 0)."""
+def whole_clamps(rest: RestShape) -> tuple[Elements, NDArray[np.int64]]:
+    """The boundary edges whose two ends are held by a handle with ``clamp``, with the constants of elastic
+    bending, and their triangles (E,) (rank 0).
+    """
     edges, faces, opposite = boundary_edges(rest.mesh.triangles)
     vector, b = edge_in_material(rest, faces, edges[:, 0], edges[:, 1])
     squared = (vector**2).sum(axis=1)
@@ -190,14 +198,25 @@ def elements(rest: RestShape) -> Elements:
         "handle": np.concatenate(numbers),
         "damping": rest.per_triangle("damping")[faces[row]] * np.concatenate(damped),
     }
-    return Elements(np.column_stack([edges[row], opposite[row]]), data)
+    return Elements(np.column_stack([edges[row], opposite[row]]), data), faces[row]
 
 
-def make(elements: Elements, scene: Scene, mass: Array) -> Clamp:
-    """The term on one rank."""
-    handles = {
+def elements(rest: RestShape) -> Elements:
+    """Those of `whole_clamps` with the part of their stiffness that never yields (rank 0)."""
+    clamps, triangle = whole_clamps(rest)
+    k = clamps.data["k"] * rest.per_triangle("elastic_share")[triangle]
+    return replace(clamps, data={**clamps.data, "k": k})
+
+
+def clamping_handles(scene: Scene) -> dict[int, tuple[Motion, Window]]:
+    """Motion and window of the handles with ``clamp``, by their numbers."""
+    return {
         number: (motion_of(scene, number), Window.of(handle))
         for number, handle in enumerate(scene.handles)
         if handle.clamp
     }
-    return Clamp(elements, handles)
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> Clamp:
+    """The term on one rank."""
+    return Clamp(elements, clamping_handles(scene))

@@ -470,7 +470,8 @@ def elements(rest: RestShape) -> Elements:
     size, area = _edge_normals(material)[1], rest.area[chosen]
     curvature = curvatures_of_tangents(material)
     stiffness = np.array([shell.plate_matrix for shell in rest.shells])[rest.shell_of[chosen]]
-    form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness, curvature)
+    elastic = area * rest.per_triangle("elastic_share")[chosen]
+    form = elastic[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness, curvature)
     rest.notes += midedge_mesh.narrow_sheet_notes(rest, chosen, number, size, area)
     rest.notes += midedge_mesh.corner_notes(rest, chosen, number, size, area)
     # the edge of a seam may have different lengths in its two triangles

@@ -163,29 +163,45 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         self.bent = values["bent"].copy()
 
 
-def elements(rest: RestShape) -> Elements:
-    """The triangles that bend by this model and have friction (rank 0)."""
+def sliding_elements(rest: RestShape, stiffness: Array, limit: Array, *, damped: bool) -> Elements:
+    """The triangles that bend by this model and slide (rank 0), of shells with these constants.
+
+    Parameters
+    ----------
+    rest : RestShape
+    stiffness : (n, 3, 3)
+        Stiffness [N·m] on (κ11, κ22, 2 κ12) before sliding; 0 for shells that do not slide.
+    limit : (n,)
+        κᵀ ``stiffness`` κ [N/m] at which sliding begins.
+    damped : bool
+        Whether the elements have the damping of the material.
+    """
     notes = list(rest.notes)
     triangles = midedge.elements(rest)
     rest.notes = notes  # those of the sheet only
     data = dict(triangles.data)
-    moments = np.array([shell.friction_moment for shell in rest.shells])
-    m1, m2 = moments[rest.shell_of[data["triangle"].astype(np.int64)]].T
-    has_friction = m1 > 0.0
-    weight = np.stack(
-        [m1 / np.where(has_friction, m2, 1.0), m2 / np.where(has_friction, m1, 1.0), 0.5 + 0.0 * m1], axis=1
-    )
-    mean, curvature = np.sqrt(m1 * m2), midedge.curvatures_of_tangents(data["material"])
-    area = midedge.areas(data["material"])
-    scale = (area * mean / YIELD_CURVATURE)[:, None, None]
-    form = scale * np.einsum("eki,ek,ekj->eij", curvature, weight, curvature)
+    shell = rest.shell_of[data["triangle"].astype(np.int64)]
+    curvature, area = midedge.curvatures_of_tangents(data["material"]), midedge.areas(data["material"])
+    form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness[shell], curvature)
     data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
-    data["r_y"] = np.sqrt(area * mean * YIELD_CURVATURE)
-    for name in ("direction", "director", "material", "length", "rest_rotation", "damping"):
+    data["r_y"] = np.sqrt(area * limit[shell])
+    for name in ("direction", "director", "material", "length", "rest_rotation"):
         del data[name]
+    if not damped:
+        del data["damping"]
     assert triangles.edges is not None
-    chosen = {name: values[has_friction] for name, values in data.items()}
-    return Elements(triangles.stencil[has_friction], chosen, edges=triangles.edges[has_friction])
+    rows = stiffness[shell, 0, 0] > 0.0
+    chosen = {name: values[rows] for name, values in data.items()}
+    return Elements(triangles.stencil[rows], chosen, edges=triangles.edges[rows])
+
+
+def elements(rest: RestShape) -> Elements:
+    """The triangles that bend by this model and have friction (rank 0)."""
+    m1, m2 = np.array([shell.friction_moment for shell in rest.shells]).T
+    mean, zero = np.sqrt(m1 * m2), np.zeros_like(m1)
+    form = np.array([[m1 * m1, zero, zero], [zero, m2 * m2, zero], [zero, zero, 0.5 * m1 * m2]])
+    stiffness = (form / np.where(mean > 0.0, mean * YIELD_CURVATURE, 1.0)).transpose(2, 0, 1)
+    return sliding_elements(rest, stiffness, mean * YIELD_CURVATURE, damped=False)
 
 
 def coarse_elements(rest: RestShape) -> Elements:
