@@ -267,7 +267,8 @@ class Material(Block):
         elastic.
     hardening : float
         Stiffness in plastic bending over the elastic one, below 1 (kinematic hardening: the elastic range of
-        moments keeps its width); 0 is perfectly plastic. Needs ``yield_curvature``.
+        moments keeps its width). Below 1e-4, as in perfect plasticity, that is taken. Needs
+        ``yield_curvature``.
     """
 
     conditional_defaults = frozenset({"bending_model"})

@@ -78,7 +78,7 @@ def test_friction_in_bending_selects_midedge(moment: Any, model: str) -> None:
         ({"bending": 1e-5, "kes": REPORT}, "kes has B"),
         ({"friction_moment": 1e-4, "kes": REPORT}, "kes has 2HB"),
         ({"friction_force": 1.0, "kes": REPORT}, "kes has 2HG"),
-        ({"kes": {"G": 0.5, "2HB": 0.1}}, "friction needs a bending stiffness"),
+        ({"kes": {"G": 0.5, "2HB": 0.1}}, "friction_moment needs a bending stiffness"),
         ({"kes": {"B": 0.0, "G": 1.0}}, "must be > 0"),
         ({"kes": {"HB": 0.1, "G": 1.0}}, "unknown key"),
         ({"kes": REPORT, "bending_model": "hinge"}, "is for bending_model: midedge"),

@@ -36,9 +36,9 @@ ISOTROPIC_LIBRARIES = ("engineering.json",)
 # would stretch along one direction without force.
 PROJECTION_FLOOR = 0.01
 
-# Smallest stiffness in plastic bending over the elastic one: with none a fold would open without a
-# moment, and terms without stiffness have no scale.
-MIN_HARDENING = 1e-6
+# Smallest stiffness in plastic bending over the elastic one: with none folds would open without a moment, and
+# which part of a strip bends would depend on round-off.
+MIN_HARDENING = 1e-4
 
 Triple = tuple[float, float, float]
 Plate = tuple[float, float, float, float]
