@@ -11,7 +11,7 @@ from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.mesh.mesh import Group, Mesh
 from lyra_petsc.mesh.readers import first_few
-from lyra_petsc.scene.schema import VertexChoice
+from lyra_petsc.scene.vertex_choice import VertexChoice
 
 DIMENSION_NAMES = ("point", "curve", "surface", "volume")
 

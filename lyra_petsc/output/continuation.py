@@ -28,7 +28,8 @@ from lyra_petsc.terms.handles.motion import Motion
 
 def used_groups(scene: Scene) -> set[str]:
     """Names of the mesh's groups that a scene uses."""
-    selectors = [*scene.handles, *scene.loads, *scene.probes.values()]
+    ends = [end for attachment in scene.attachments for end in (attachment.start, attachment.to)]
+    selectors = [*scene.handles, *scene.loads, *scene.probes.values(), *ends]
     names = {block.group for block in scene.material} | {selector.group for selector in selectors}
     return {name for name in names if name is not None}
 

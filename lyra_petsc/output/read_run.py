@@ -18,6 +18,7 @@ from lyra_petsc.extras import require_packages
 from lyra_petsc.output.file_operations import possible_path, reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.layout import (
+    ATTACHMENTS,
     HISTORY,
     LOCK_FILE,
     MESH_FILE,
@@ -259,6 +260,11 @@ class StoredRun:
     def volumes(self) -> Any:
         """volumes.csv, a row for each closed volume and step [m³], [Pa]; empty if the scene has none."""
         return as_frame(self._table(VOLUMES))
+
+    @property
+    def attachments(self) -> Any:
+        """attachments.csv, a row for each attachment and step [N], [m]; empty if the scene has none."""
+        return as_frame(self._table(ATTACHMENTS))
 
     @cached_property
     def _history(self) -> Columns:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import html
 import math
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args
@@ -27,6 +26,7 @@ from pydantic import (
 )
 
 from lyra_petsc.errors import suggest
+from lyra_petsc.scene.attachment_block import Attachment
 from lyra_petsc.scene.block import BY_KIND, Block
 from lyra_petsc.scene.camera_block import Render
 from lyra_petsc.scene.fit_block import Fit
@@ -41,7 +41,6 @@ from lyra_petsc.scene.values import (
     Direction,
     Flag,
     Fraction,
-    Index,
     Name,
     NonNegative,
     Number,
@@ -62,8 +61,8 @@ from lyra_petsc.scene.values import (
     problem,
     require,
     shown,
-    vector,
 )
+from lyra_petsc.scene.vertex_choice import VertexChoice
 
 MESH_SUFFIXES = (".geo", ".msh", ".obj", ".stl", ".ply", ".off", ".vtk", ".inp", ".bdf", ".unv")
 
@@ -199,42 +198,6 @@ class UniformWind(Block):
     velocity: Annotated[VectorInTime, AfterValidator(_speed)]
     density: NonNegative
     drag: NonNegative = 0.0
-
-
-class VertexChoice(Block):
-    """Vertices by group, nodes or box.
-
-    Attributes
-    ----------
-    group : str or None
-        A group of the mesh, or the name of a sheet.
-    nodes : list of int or None
-        Numbers of vertices from 0, in file order.
-    box : two (3,) [m] or None
-        Lower and upper corner of a box; it selects by start positions and includes its faces.
-    """
-
-    group: Name | None = None
-    nodes: Annotated[list[Index], list_of(" of vertex numbers", minimum=1)] | None = None
-    box: tuple[Vec3, Vec3] | None = None
-
-    @field_validator("nodes")
-    @classmethod
-    def _check_unique(cls, nodes: list[int] | None) -> list[int] | None:
-        if nodes is not None and len(set(nodes)) != len(nodes):
-            twice = Counter(nodes).most_common(1)[0][0]
-            raise problem(f"lists vertex {twice} twice")
-        return nodes
-
-    @field_validator("box", mode="before")
-    @classmethod
-    def _check_box(cls, value: Any) -> Any:
-        if not isinstance(value, (list, tuple)) or len(value) != 2:
-            raise problem(f"must be two corners [[x, y, z], [x, y, z]], not {shown(value)}")
-        low, high = vector(value[0]), vector(value[1])
-        if any(a > b for a, b in zip(low, high, strict=True)):
-            raise problem("must have its lower corner first")
-        return low, high
 
 
 class Selector(VertexChoice):
@@ -861,6 +824,8 @@ class Scene(Block):
         Acceleration of gravity; without this key there is none.
     wind : UniformWind or None
         Uniform wind; without this key there is no air.
+    attachments : list of Attachment
+        Springs between points of the sheets: buttons, pockets, ends of cables.
     handles : list of Handle
         Vertices whose motion is prescribed, or which springs pull.
     motions : dict of list of Keyframe
@@ -894,6 +859,7 @@ class Scene(Block):
     material: Annotated[list[Material], BeforeValidator(_one_or_many)]
     gravity: VectorInTime | None = None
     wind: UniformWind | None = None
+    attachments: Annotated[list[Attachment], list_of()] = Field(default_factory=list)
     handles: Annotated[list[Handle], list_of()] = Field(default_factory=list)
     motions: Annotated[dict[Name, Keyframes], block_of("names")] = Field(default_factory=dict)
     contact: Contact | None = None

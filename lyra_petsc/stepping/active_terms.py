@@ -18,6 +18,7 @@ from lyra_petsc.terms.protocols import (
     MovingTargets,
     SharesFrozen,
     Stateful,
+    TellsEvents,
 )
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
@@ -55,8 +56,8 @@ class ActiveTerms:
         Terms of ``sheet`` with moving targets or obstacles; those with targets; that with obstacles.
     limiting : list of LimitsStep
         Terms that limit the length of steps, besides contact.
-    stateful, dissipating : list of Stateful
-        Terms with a state; those of which steps make heat.
+    stateful, dissipating, telling : list of Stateful
+        Terms with a state; those of which steps make heat; those with events for the user.
     of_contact, sliding, barriers : list of Elastic
         The terms of contact, friction alone, and the barrier alone, if there are any.
     with_edges, with_geometry : list of Elastic
@@ -84,6 +85,7 @@ class ActiveTerms:
         limiting = [term for term in self.elastic if isinstance(term, LimitsStep)]
         self.limiting = [term for term in limiting if not term.registration.of_contact]
         self.stateful = [term for term in self.elastic if isinstance(term, Stateful)]
+        self.telling = [term for term in self.stateful if isinstance(term, TellsEvents)]
         self.sliding: list[Any] = [term for term in self.external if term.registration.of_contact]
         self.of_contact: list[Any] = [term for term in self.elastic if term.registration.of_contact]
         self.barriers = [term for term in self.of_contact if term not in self.sliding]

@@ -45,7 +45,7 @@ from lyra_petsc.terms.handles.prescribed_handles import (
     select_exact,
 )
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.protocols import GlobalSums, HasDirectors
+from lyra_petsc.terms.protocols import HasDirectors, SumsOverRanks
 from lyra_petsc.terms.registry import Role, make_term, needed_terms, registration_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Load, Term
@@ -411,7 +411,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     terms = {n: make_term(registration_of(n), part.elements.get(n), scene, on_vertices) for n in whole.terms}
     _set_up_contact(scene, whole, terms, layout, mesh)
     for term in terms.values():
-        if isinstance(term, GlobalSums):
+        if isinstance(term, SumsOverRanks):
             term.set_communication(lambda values: layout.global_sum(*values))
         if isinstance(term, (Elastic, Load)):
             term.connect(terms.values())

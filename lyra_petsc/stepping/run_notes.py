@@ -109,6 +109,11 @@ def note_step(run: SteppedScene, attempt: Attempt) -> None:
                 f"at this stiffness, {times:.1g} times the loads"
                 + (doubt if run.scene.time.static and times > DOUBTFUL else ""),
             )
+    equations = run.problem.equations
+    for term in equations.active.telling:
+        told = run.comm.allgather(term.events(equations.x, equations.step.frozen[term]))
+        for subject, text in sorted(event for events in told for event in events):
+            notes.once(subject, f"{when}: {text}")
     if run.stepper.solver.stopped_by:
         notes.once(
             "option",

@@ -10,7 +10,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
-from lyra_petsc.mesh.topology import connected_pieces
+from lyra_petsc.mesh.topology import connected_components
 from lyra_petsc.scene.schema import Keyframe, Scene
 from lyra_petsc.scene.time_curve import acts, kink_times
 from lyra_petsc.scene.values import AXES
@@ -81,8 +81,11 @@ def nothing_holds(
     loads = [entry for entry in terms if entry.role is Role.LOAD and entry.name not in on_edges]
     if not scene.time.static or scene.contact is not None or not loads:
         return []
-    piece = np.empty(mesh.n_vertices, dtype=np.int64)
-    piece[mesh.triangles] = connected_pieces(mesh.triangles)[:, None]
+    # parts that springs or threads hold together are one piece
+    elastic = [elements[e.name].stencil for e in terms if e.role is Role.ELASTIC and e.name in elements]
+    links = [np.stack([stencil[:, 0], other], axis=1) for stencil in elastic for other in stencil.T[1:]]
+    joined = connected_components(mesh.n_vertices, np.concatenate(links))
+    piece = np.unique(joined, return_inverse=True)[1].astype(np.int64)
     factors = {1.0, *(factor for factor in kink_times(scene) if 0.0 <= factor <= 1.0)}
     forces: Array = np.zeros((len(factors), mesh.n_vertices, 3))
     for entry in loads:

@@ -121,6 +121,16 @@ class Dissipates(Stateful):
         """Energy [J] of the owned elements that becomes heat when the step to x is accepted."""
 
 
+class TellsEvents(Stateful):
+    """An energy with events of which the user should know, such as that a spring breaks."""
+
+    @abstractmethod
+    def events(self, x: Array, frozen: Any) -> list[tuple[str, str]]:
+        """Subject and text of each event among the owned elements when the step to x is accepted, called
+        before `accept`; notes tell the first one of each subject.
+        """
+
+
 class LimitsStep(Elastic):
     """An energy that is infinite beyond a limit, which no step may pass.
 
@@ -177,13 +187,8 @@ def _alone(sums: Array) -> Array:
     return sums
 
 
-class GlobalSums(Elastic):
-    """An energy that depends on sums over the elements of all ranks, such as an enclosed volume.
-
-    Its Hessian is the sum of block rows and of w g gᵀ for each sum, with its gradient g, which is applied to
-    vectors and never assembled. Without the sums at positions x, in ``frozen`` data that `at` returns,
-    methods compute them, and are collective.
-    """
+class SumsOverRanks(Elastic):
+    """An energy with results that are sums over the elements of all ranks."""
 
     over_ranks: Callable[[Array], Array] = staticmethod(_alone)
     """Returns sums over ranks of an array's numbers; collective."""
@@ -191,6 +196,15 @@ class GlobalSums(Elastic):
     def set_communication(self, over_ranks: Callable[[Array], Array]) -> None:
         """Set `over_ranks`, before other methods are called; collective."""
         self.over_ranks = over_ranks
+
+
+class GlobalSums(SumsOverRanks):
+    """An energy that depends on sums over the elements of all ranks, such as an enclosed volume.
+
+    Its Hessian is the sum of block rows and of w g gᵀ for each sum, with its gradient g, which is applied to
+    vectors and never assembled. Without the sums at positions x, in ``frozen`` data that `at` returns,
+    methods compute them, and are collective.
+    """
 
     @abstractmethod
     def at(self, x: Array, frozen: Any) -> Any:
@@ -201,7 +215,7 @@ class GlobalSums(Elastic):
         """Weights w (k,), not negative, and vectors g (k, n_local, 3), right in owned rows."""
 
 
-class WritesTable(Elastic):
+class WritesTable(SumsOverRanks):
     """A term with a table of its own in the folder of a run, whose first columns are step and time."""
 
     table: ClassVar[str]

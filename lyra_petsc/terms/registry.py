@@ -223,6 +223,9 @@ REGISTRY: list[Registration] = [
         module_name=".bending.clamp_plasticity",
     ),
     Registration(
+        "attachments", lambda scene, shells: bool(scene.attachments), Role.ELASTIC, "attachment_energy"
+    ),
+    Registration(
         "spring",
         lambda scene, shells: any(h.stiffness is not None or h.fade > 0 for h in scene.handles),
         Role.EXTERNAL,

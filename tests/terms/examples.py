@@ -14,6 +14,8 @@ from physics import CLOTH, Simulation, obj_file
 
 BENDING = CLOTH | {"bending": [2.0e-3, 1.0e-3, 3.0e-3], "damping": 0.02, "warp_degrees": 25.0}
 
+TAUT = {"length": "start"}
+
 FRAGMENTS: dict[str, dict[str, Any]] = {
     "membrane": {},
     "bending": {},
@@ -30,6 +32,12 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
     "stretch_limit": {"material": BENDING | {"stretch_limit": 1.8}},
     "shear_friction": {"material": BENDING | {"friction_force": 2.0}},
     "clamp": {"handles": [{"nodes": [0, 1, 2, 3], "clamp": True}]},
+    "attachments": {
+        "attachments": [
+            {"from": {"nodes": [0]}, "to": {"nodes": [11]}, "stiffness": 60.0, "breaks_at": 1.0} | TAUT,
+            {"from": {"nodes": [3, 4]}, "to": {"point": [0.1, 0.5, 0.2]}, "stiffness": 90.0} | TAUT,
+        ]
+    },
     "spring": {"handles": [{"nodes": [1, 5, 9], "stiffness": 300.0}, {"nodes": [9, 10], "stiffness": 50.0}]},
     "chambers": {
         "loads": [
