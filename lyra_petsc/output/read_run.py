@@ -44,7 +44,7 @@ Columns: TypeAlias = dict[str, NDArray[Any]]
 ENERGIES = ("kinetic_energy", *energies.ENERGIES)
 ITERATIONS = ("newton_iterations", "linear_iterations", "rejected")
 INTEGER_COLUMNS = frozenset({"step", *ITERATIONS})
-TEXT_COLUMNS = frozenset({"obstacle"})
+TEXT_COLUMNS = frozenset({"obstacle", "name"})
 
 
 class StoredRun:

@@ -40,7 +40,7 @@ class AttachmentSprings(Dissipates, TellsEvents, WritesTable):
     """
 
     table = "attachments.csv"
-    table_columns = ("attachment", "holding", "distance", "fx", "fy", "fz", "tension")
+    table_columns = ("name", "holding", "distance", "fx", "fy", "fz", "tension")
     table_units = ("", "", "m", "N", "N", "N", "N")
 
     def __init__(self, elements: Elements, count: int) -> None:

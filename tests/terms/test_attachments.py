@@ -239,7 +239,7 @@ def test_a_resumed_run_has_the_same_springs(comm: MPI.Comm, shared_tmp: Path) ->
         again, x = shape(simulation), simulation.problem.equations.x
         rows = springs(simulation).table_rows(x)
     if comm.rank == 0:
-        table = StoredRun(folder).attachments
+        table = {name: np.asarray(values) for name, values in StoredRun(folder).attachments.items()}
         assert [len(table["step"]), table["holding"][0], table["holding"][-2]] == [22, 3, rows[0][1]]
         np.testing.assert_allclose(table["tension"][-2:], [row[-1] for row in rows], rtol=1e-12)
         assert 0 < rows[0][1] < 3
