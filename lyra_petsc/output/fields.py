@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,12 @@ from lyra_petsc.stepping.problem import Problem
 
 if TYPE_CHECKING:
     from lyra_petsc.terms.bending.hinge import Bending
+    from lyra_petsc.terms.bending.hinge_plasticity import HingePlasticity
     from lyra_petsc.terms.bending.midedge import MidEdge
+    from lyra_petsc.terms.bending.midedge_plasticity import MidEdgePlasticity
     from lyra_petsc.terms.protocols import Located
 
-    OnHinges = Callable[[Bending, "Array", Located], "Array"]
-    OnTriangles = Callable[[MidEdge, "Array", Located], "Array"]
+    OnElements = Callable[[Any, "Array", Located], "Array"]
 
 Ints = NDArray[np.int32]
 
@@ -69,43 +70,54 @@ def _density_on_vertices(problem: Problem, rows: Ints, values: Array) -> Array:
     return np.bincount(rows, values, n_local)[:n_owned] / area[:n_owned]
 
 
-def _bending_density(problem: Problem, of_hinges: OnHinges, of_triangles: OnTriangles) -> Array:
-    """Density on vertices of a quantity of bending elements, (n_owned,).
+def _bending_density(problem: Problem, of_terms: Mapping[str, OnElements]) -> Array:
+    """Density on vertices of quantities of bending elements, by the names of their terms, (n_owned,).
 
     A hinge's value is divided between the two ends of its edge, a triangle's among its three corners.
     """
     here, out = problem.equations.here(), np.zeros(problem.points.n_vertices)
-    if "bending" in problem.terms:
-        hinges = cast("Bending", problem.terms["bending"])
-        halves = np.repeat(0.5 * of_hinges(hinges, here.x, here.frozen[hinges]), 2)
-        out += _density_on_vertices(problem, hinges.stencil[:, :2].ravel(), halves)
-    if "midedge" in problem.terms:
-        midedge = cast("MidEdge", problem.terms["midedge"])
-        thirds = np.repeat(of_triangles(midedge, here.x, here.frozen[midedge]) / 3.0, 3)
-        out += _density_on_vertices(problem, midedge.stencil.ravel(), thirds)
+    for name, quantity in of_terms.items():
+        if name in problem.terms:
+            term: Any = problem.terms[name]
+            rows = term.stencil[:, :2] if term.stencil.shape[1] == 4 else term.stencil
+            count = rows.shape[1]
+            shares = np.repeat(quantity(term, here.x, here.frozen[term]) / count, count)
+            out += _density_on_vertices(problem, rows.ravel(), shares)
     return out
 
 
 def _bending_energy(problem: Problem) -> Array:
-    return _bending_density(
-        problem,
-        lambda hinges, x, frozen: hinges.all_energies(x, frozen, hinges.n_elements),
-        lambda midedge, x, frozen: midedge.all_energies(x, frozen, midedge.n_elements),
-    )
+    def energies(term: Any, x: Array, frozen: Located) -> Array:
+        out: Array = term.all_energies(x, frozen, term.n_elements)
+        return out
+
+    names = "bending", "midedge", "hinge_plasticity", "midedge_plasticity", "midedge_friction"
+    return _bending_density(problem, dict.fromkeys(names, energies))
 
 
 def _curvature(problem: Problem) -> Array:
     """Sum of the principal curvatures on vertices [1/m]."""
-    return _bending_density(
-        problem,
+
+    def of_hinges(hinges: Bending, x: Array, frozen: Located) -> Array:
+        return -hinges.elements.data["length"] * hinges.weights(x) * hinges.angles(x, frozen)
+
+    def of_triangles(midedge: MidEdge, x: Array, frozen: Located) -> Array:
         # NaN curvatures: the angle of a collapsed triangle is undefined
-        lambda hinges, x, frozen: (
-            -hinges.elements.data["length"] * hinges.weights(x) * hinges.angles(x, frozen)
-        ),
-        lambda midedge, x, frozen: (
-            midedge.areas * np.nan_to_num(midedge.curvatures(x, frozen)[:, :2].sum(axis=1))
-        ),
-    )
+        return midedge.areas * np.nan_to_num(midedge.curvatures(x, frozen)[:, :2].sum(axis=1))
+
+    return _bending_density(problem, {"bending": of_hinges, "midedge": of_triangles})
+
+
+def _plastic_curvature(problem: Problem) -> Array:
+    """Sum of the principal curvatures [1/m], less those of rest, that remain where no moments act."""
+
+    def of_hinges(hinges: HingePlasticity, x: Array, frozen: Located) -> Array:
+        return -hinges.elements.data["length"] * hinges.plastic_angles
+
+    def of_triangles(triangles: MidEdgePlasticity, x: Array, frozen: Located) -> Array:
+        return triangles.areas * triangles.plastic_curvatures[:, :2].sum(axis=1)
+
+    return _bending_density(problem, {"hinge_plasticity": of_hinges, "midedge_plasticity": of_triangles})
 
 
 def _curvature_tensor(problem: Problem) -> Array:
@@ -154,6 +166,7 @@ class Field:
 
 
 _BENDING = ("bending", "midedge")
+_YIELDING = ("hinge_plasticity", "midedge_plasticity")
 
 
 FIELDS = {
@@ -167,6 +180,7 @@ FIELDS = {
         Field("bending_energy", "vertex", _bending_energy, _BENDING),
         Field("curvature", "vertex", _curvature, _BENDING),
         Field("curvature_tensor", "triangle", _curvature_tensor, ("midedge",)),
+        Field("plastic_curvature", "vertex", _plastic_curvature, _YIELDING),
         Field("contact_pressure", "vertex", _contact_pressure, ("contact",)),
         Field("rank", "vertex", _rank),
     )
@@ -207,6 +221,7 @@ def check_field(field: Field, problem: Problem) -> None:
         reasons: dict[tuple[str, ...], str] = {
             ("contact",): "no contact?",
             ("midedge",): "bending_model: hinge?",
+            _YIELDING: "no yield_curvature?",
         }
         why = reasons.get(field.terms, "bending: 0?")
         raise InputError(

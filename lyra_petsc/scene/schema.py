@@ -617,6 +617,7 @@ FIELD_UNITS = {
     "bending_energy": "J/m²",
     "curvature": "1/m",
     "curvature_tensor": "1/m",
+    "plastic_curvature": "1/m",
     "contact_pressure": "Pa",
     "rank": "1",
 }

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from physics import end_on_one_rank, gathered, grid, scene_of
 
 from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.output.fields import FIELDS
 from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
@@ -147,6 +148,8 @@ def test_spring_back_of_a_bent_strip(model: str) -> None:
     with Bench(MPI.COMM_SELF) as bench, bench.simulation(content) as trial:
         x = trial.run().x
         stored = trial.simulation.energy_balance.budget.bending / (LENGTH * WIDTH)
+        plastic = FIELDS["plastic_curvature"].compute(trial.simulation.problem)
+        energy = FIELDS["bending_energy"].compute(trial.simulation.problem)
     tip = x[N]  # of an arc from the origin along x
     turned = 2.0 * math.atan2(tip[2], tip[0])
     remaining = (1.0 - HARDENING) * (25.0 - YIELD)
@@ -155,6 +158,9 @@ def test_spring_back_of_a_bent_strip(model: str) -> None:
     # residual moments of both elements cancel: h κ = −(1 − h) (κ − 15), with the energy of both
     expected = 0.5 * B * HARDENING * (1.0 - HARDENING) * (25.0 - YIELD) ** 2
     assert stored == pytest.approx(expected * length / LENGTH, rel=5e-3)
+    middle = np.s_[N // 2 :: N + 1]
+    np.testing.assert_allclose(plastic[middle], remaining, rtol=5e-3)
+    np.testing.assert_allclose(energy[middle], expected, rtol=1e-2)
 
 
 def falling(integrator: str, model: str, step: float = 0.002) -> dict[str, Any]:

@@ -180,7 +180,7 @@ def quantity(run: StoredRun, name: str) -> ColourQuantity:
     return ColourQuantity(label, values, on_triangles, name in _SIGNED, name not in _NOT_AVERAGED)
 
 
-_SIGNED = {"curvature"}
+_SIGNED = {"curvature", "plastic_curvature"}
 _NOT_AVERAGED = {"rank"}
 
 

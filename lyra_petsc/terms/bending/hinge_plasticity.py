@@ -32,7 +32,7 @@ class PlasticAngles(Dissipates):
     ----------
     elements : Elements
         With data ``k`` (E,) [N·m] of the energy k θ² before yield, ``rest_angle`` and ``yield_angle`` (E,)
-        [rad].
+        [rad], ``slid_share`` (E,) fraction of the stiffness that yields.
 
     Attributes
     ----------
@@ -61,6 +61,11 @@ class PlasticAngles(Dissipates):
     def initialise(self, x: Array) -> None:
         """The angles of the start, as far as they are beyond the yield angle."""
         raise NotImplementedError
+
+    @property
+    def plastic_angles(self) -> Array:
+        """Angles (E,) [rad], less those of rest, that remain where no moments act."""
+        return self.elements.data["slid_share"] * (self.bent - self.elements.data["rest_angle"])
 
     def accept(self, x: Array, frozen: Any) -> None:
         self.bent = self.bent + self.limits.slid(self.angles_at(x, frozen) - self.bent)
@@ -110,7 +115,8 @@ def yielding(hinges: Elements, triangle: Ints, rest: RestShape, height: Array) -
     curvature = rest.per_triangle("yield_curvature")[triangle]
     rows = np.flatnonzero(np.isfinite(curvature))
     data = {name: values[rows] for name, values in hinges.data.items()}
-    data["k"] = data["k"] * (1.0 - rest.per_triangle("elastic_share")[triangle[rows]])
+    data["slid_share"] = 1.0 - rest.per_triangle("elastic_share")[triangle[rows]]
+    data["k"] = data["k"] * data["slid_share"]
     data["yield_angle"] = 0.5 * curvature[rows] * height[rows]
     return Elements(hinges.stencil[rows], data)
 

@@ -109,7 +109,11 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         return sliding.tangent, stiffness, self.bent, data["limit"], sliding.friction
 
     def energies(self, x: Array, frozen: Frames | Located) -> Array:
-        out = np.empty(self.n_owned)
+        return self.all_energies(x, frozen, self.n_owned)
+
+    def all_energies(self, x: Array, frozen: Frames | Located, n: int) -> Array:
+        """Energy [J] of the first n triangles of this rank, (n,)."""
+        out = np.empty(n)
         midedge_energy.energies(*self._constants(self._sliding(x, frozen)), out)
         return out
 
@@ -163,7 +167,7 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         self.bent = values["bent"].copy()
 
 
-def sliding_elements(rest: RestShape, stiffness: Array, limit: Array, *, damped: bool) -> Elements:
+def sliding_elements(rest: RestShape, stiffness: Array, limit: Array, *also: str) -> Elements:
     """The triangles that bend by this model and slide (rank 0), of shells with these constants.
 
     Parameters
@@ -173,8 +177,8 @@ def sliding_elements(rest: RestShape, stiffness: Array, limit: Array, *, damped:
         Stiffness [N·m] on (κ11, κ22, 2 κ12) before sliding; 0 for shells that do not slide.
     limit : (n,)
         κᵀ ``stiffness`` κ [N/m] at which sliding begins.
-    damped : bool
-        Whether the elements have the damping of the material.
+    *also : str
+        Names of constants of `MidEdge` that the elements keep, too.
     """
     notes = list(rest.notes)
     triangles = midedge.elements(rest)
@@ -185,10 +189,8 @@ def sliding_elements(rest: RestShape, stiffness: Array, limit: Array, *, damped:
     form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness[shell], curvature)
     data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
     data["r_y"] = np.sqrt(area * limit[shell])
-    for name in ("direction", "director", "material", "length", "rest_rotation"):
+    for name in {"direction", "director", "material", "length", "rest_rotation", "damping"}.difference(also):
         del data[name]
-    if not damped:
-        del data["damping"]
     assert triangles.edges is not None
     rows = stiffness[shell, 0, 0] > 0.0
     chosen = {name: values[rows] for name, values in data.items()}
@@ -201,7 +203,7 @@ def elements(rest: RestShape) -> Elements:
     mean, zero = np.sqrt(m1 * m2), np.zeros_like(m1)
     form = np.array([[m1 * m1, zero, zero], [zero, m2 * m2, zero], [zero, zero, 0.5 * m1 * m2]])
     stiffness = (form / np.where(mean > 0.0, mean * YIELD_CURVATURE, 1.0)).transpose(2, 0, 1)
-    return sliding_elements(rest, stiffness, mean * YIELD_CURVATURE, damped=False)
+    return sliding_elements(rest, stiffness, mean * YIELD_CURVATURE)
 
 
 def coarse_elements(rest: RestShape) -> Elements:

@@ -18,6 +18,8 @@ hardening as an elastic element beside a perfectly plastic one: J. F. Besseling,
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from lyra_petsc.arrays import Array
@@ -25,12 +27,33 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending.hinge import whole_hinges
 from lyra_petsc.terms.bending.hinge_plasticity import yielding
+from lyra_petsc.terms.bending.midedge import areas, curvatures_of_tangents
 from lyra_petsc.terms.bending.midedge_friction import MidEdgeFriction, sliding_elements
 from lyra_petsc.terms.rest import RestShape
 
 
 class MidEdgePlasticity(MidEdgeFriction):
-    """The triangles that may yield."""
+    """The triangles that may yield.
+
+    Parameters
+    ----------
+    elements : Elements
+        As of `MidEdgeFriction`; data ``slid_share`` (E,) fraction of the stiffness that yields, ``damping``
+        and ``material`` as of `MidEdge`.
+    """
+
+    @property
+    def areas(self) -> Array:
+        """Rest areas of the triangles, (E,) [m²]."""
+        return areas(self.elements.data["material"])
+
+    @property
+    def plastic_curvatures(self) -> Array:
+        """κ11, κ22, 2 κ12 (E, 3) [1/m], less those of rest, that remain where no moments act."""
+        data = self.elements.data
+        of_tangents = curvatures_of_tangents(data["material"])
+        slid = data["slid_share"][:, None] * (self.bent - data["rest"])
+        return np.asarray(np.einsum("eki,ei->ek", of_tangents, slid))
 
 
 def elements(rest: RestShape) -> Elements:
@@ -41,7 +64,9 @@ def elements(rest: RestShape) -> Elements:
             share = 1.0 - shell.elastic_share
             stiffness[number] = share * np.array(shell.plate_matrix)
             limit[number] = share * shell.strip_stiffness * shell.yield_curvature**2
-    return sliding_elements(rest, stiffness, limit, damped=True)
+    triangles = sliding_elements(rest, stiffness, limit, "damping", "material")
+    shares = 1.0 - rest.per_triangle("elastic_share")[triangles.data["triangle"].astype(np.int64)]
+    return replace(triangles, data={**triangles.data, "slid_share": shares})
 
 
 def coarse_elements(rest: RestShape) -> Elements:
