@@ -317,9 +317,9 @@ class ContactBarrier(LimitsStep):
 
     # -- obstacles that move, and forces on them ---------------------------------------------------
 
-    def _obstacle_gradients(self, x: Array, obstacle_x: Array) -> Iterator[tuple[int, Array]]:
+    def _obstacle_gradients(self, x: Array, obstacle_x: Array) -> Iterator[tuple[int, Array, Array]]:
         """Numbers of obstacles in contact, and for each the forces (n_local, 3) [N] of this rank's pairs on
-        it.
+        it, and the gradient (m, 3) [N] of their energy by the points of obstacles.
         """
         active = self.active_pairs(x, obstacle_x)
         number = self.pairs.obstacle[active.pair]
@@ -329,14 +329,14 @@ class ContactBarrier(LimitsStep):
             arrays = active.pair, active.owned_weight, active.beta, active.derivatives
             chosen_arrays = unwritable(*(array[rows] for array in arrays))
             contact_pairs.add_gradient(x, obstacle_x, *self._pair_data, chosen_arrays, gradient, on_obstacles)
-            yield int(obstacle), gradient
+            yield int(obstacle), gradient, on_obstacles
 
     def obstacle_forces(self, x: Array, frozen: ObstaclePositions) -> Array:
         """Force [N] of this rank's pairs on each obstacle, its torque [N m] about the origin, the sum over
         contacts of the magnitudes of normal forces [N], and 0, (obstacles, 8).
         """
         out = np.zeros((len(self.obstacles.bodies), 8))
-        for obstacle, force in self._obstacle_gradients(x, frozen.end):
+        for obstacle, force, _ in self._obstacle_gradients(x, frozen.end):
             out[obstacle, :6] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
         contacts = self.find_contacts(x, frozen.end)
         on = contacts.obstacle >= 0
@@ -347,11 +347,14 @@ class ContactBarrier(LimitsStep):
         """Work [J] of moving obstacles on this rank's pairs between the times ``start`` and ``end`` [s], by
         the forces at positions x (n_local, 3) with obstacles at time ``at``.
         """
-        to_start, to_end = (self.obstacles.rigid_motions(at, time) for time in (start, end))
+        to_start, to_end = (self.obstacles.motions(at, time) for time in (start, end))
         work = 0.0
-        for obstacle, force in self._obstacle_gradients(x, self.obstacles.positions(at)):
-            (r0, t0), (r1, t1) = to_start[obstacle], to_end[obstacle]
-            work -= float(np.vdot(force, x @ (r1 - r0).T + t1 - t0))
+        for obstacle, force, on_points in self._obstacle_gradients(x, self.obstacles.positions(at)):
+            if obstacle in to_end.deforming:
+                work += float(np.vdot(on_points, to_end.end - to_start.end))
+            else:
+                (r0, t0), (r1, t1) = to_start.rigid[obstacle], to_end.rigid[obstacle]
+                work -= float(np.vdot(force, x @ (r1 - r0).T + t1 - t0))
         return work
 
     def moved_with_obstacles(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Array:
@@ -362,10 +365,11 @@ class ContactBarrier(LimitsStep):
             return dx
         blocked = self.largest_steps(x, dx, frozen) < 1.0
         moved = dx.copy()
-        for number, (rotation, translation) in enumerate(frozen.motions):
+        for number in range(len(self.obstacles.bodies)):
             points = self.pairs.points[blocked & (self.pairs.obstacle == number)]
-            points = np.unique(points[points >= 0])
-            moved[points] = (x @ rotation.T + translation - x)[points]
+            pair, corner = np.nonzero(points >= 0)
+            own = points[pair, corner]
+            moved[own] = frozen.motions.carried(number, x[own], points[pair])[0] - x[own]
         for points in self.pairs.points[blocked & (self.pairs.obstacle < 0)]:  # a sheet moves the next one
             changed = (moved[points] != dx[points]).any(axis=1)
             if changed.any():
@@ -388,7 +392,9 @@ class ContactBarrier(LimitsStep):
             contact_pairs.cancel_negative(near.kind[pair], near.points[pair, 0], normal, force)
         rows, sheet_beta = self.stencil[pair].astype(np.int64), np.where(near.points[pair] >= 0, beta, 0.0)
         obstacle = near.obstacle[pair]
-        contacts = Contacts(pair, rows, sheet_beta, beta, normal, force, distance[:n], obstacle)
+        contacts = Contacts(
+            pair, rows, sheet_beta, beta, normal, force, distance[:n], obstacle, near.points[pair]
+        )
         return chosen(contacts, force > 0.0)
 
     def contact_stiffness(self, contacts: Contacts) -> Array:

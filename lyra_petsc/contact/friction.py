@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.contact import friction_pairs
 from lyra_petsc.contact.barrier import ContactBarrier
+from lyra_petsc.contact.body_motions import BodyMotions
 from lyra_petsc.contact.friction_consistency import friction_lag, slip_under_changed_forces
 from lyra_petsc.contact.friction_history import (
     continued_pairs,
@@ -31,7 +32,6 @@ from lyra_petsc.contact.friction_history import (
 )
 from lyra_petsc.contact.friction_step import (
     EndFriction,
-    Motions,
     StartingFriction,
     StepFriction,
     moved_pairs,
@@ -61,8 +61,8 @@ class ObstacleMotion(NamedTuple):
     times : (float, float)
         Time [s] at which the pairs were found, and that of the forces. Pairs are found at the start of the
         step, or in statics after a part of a load step.
-    motions : list of (3, 3) and (3,)
-        Rotation and translation [m] of each obstacle between these ``times``.
+    motions : BodyMotions
+        Motions of the obstacles between these ``times``.
     end_points : (m, 3)
         Points [m] and normals of the obstacles at the end of the step.
     """
@@ -70,7 +70,7 @@ class ObstacleMotion(NamedTuple):
     start: float
     time: float
     times: tuple[float, float]
-    motions: Motions
+    motions: BodyMotions
     end_points: Array
 
 
@@ -230,7 +230,7 @@ class CoulombFriction(Stateful):
     def freeze(self, step: UpcomingStep) -> ObstacleMotion:
         obstacles = self._contact.obstacles
         times = step.start if self._contact_time is None else self._contact_time, step.target_time
-        motions, points = obstacles.rigid_motions(*times), obstacles.positions(step.end)
+        motions, points = obstacles.motions(*times), obstacles.positions(step.end)
         return ObstacleMotion(step.start, step.end, times, motions, points)
 
     def energies(self, x: Array, frozen: ObstacleMotion) -> Array:
@@ -318,7 +318,9 @@ class CoulombFriction(Stateful):
         continues = np.concatenate([~new.slides & (previous >= 0), np.zeros(n_before, dtype=np.bool_)])
         holds = continues & (np.linalg.norm(force, axis=1) <= static)
         rows, obstacles = np.concatenate([rows, before.rows]), self._contact.obstacles
-        velocity = obstacles.contact_velocities(x, v, rows, pairs.beta, pairs.obstacle, last)
+        velocity = obstacles.contact_velocities(
+            x, v, rows, pairs.beta, pairs.obstacle, pairs.body_points, last
+        )
         still, velocity = STILL * self._contact.barrier.gap, pairs.along(velocity)
         return EndFriction(rows, pairs, force, applied, static, kinetic, holds, velocity, still)
 
@@ -376,7 +378,7 @@ class CoulombFriction(Stateful):
         # the same pairs as now, with slip from the start
         again, rows, _, previous = continued_pairs(barrier, contacts, x, start_x, old)
         begin = frozen.start if time is None else time
-        again = moved_pairs(again, barrier.obstacles.rigid_motions(begin, frozen.time))
+        again = moved_pairs(again, barrier.obstacles.motions(begin, frozen.time))
         continues = previous >= 0
         n = len(previous)
         self._pairs = chosen(joined([again, pairs]), np.where(continues, 0, n) + np.arange(n))

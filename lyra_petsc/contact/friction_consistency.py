@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.contact.friction_step import Motions, StepFriction
+from lyra_petsc.contact.body_motions import BodyMotions
+from lyra_petsc.contact.friction_step import StepFriction
 from lyra_petsc.contact.obstacle_points import Obstacles
 from lyra_petsc.contact.pairs import Contacts, Rows
 
@@ -39,7 +40,7 @@ def slip_under_changed_forces(
     step: StepFriction,
     contacts: Contacts,
     obstacles: Obstacles,
-    motions: Motions,
+    motions: BodyMotions,
     n_vertices: int,
 ) -> tuple[float, float]:
     """How far points slip while normal forces change, in a solve by dx (n_local, 3) [m] to x.
@@ -54,12 +55,16 @@ def slip_under_changed_forces(
         return total, moment / np.maximum(total, TINY)
 
     beta, normal = contacts.sheet_beta, contacts.normal
-    moved = obstacles.contact_displacements(x, contacts.rows, beta, contacts.obstacle, motions)
+    moved = obstacles.contact_displacements(
+        x, contacts.rows, beta, contacts.obstacle, contacts.points, motions
+    )
     slip = np.einsum("ei,eik->ek", beta, dx[contacts.rows]) - moved
     slip -= np.einsum("ek,ek->e", slip, normal)[:, None] * normal
     after, slip_after = by_vertex(contacts.rows, contacts.force, slip)
     pairs = step.pairs
-    moved = obstacles.contact_displacements(x, step.rows, pairs.beta, pairs.obstacle, motions)
+    moved = obstacles.contact_displacements(
+        x, step.rows, pairs.beta, pairs.obstacle, pairs.body_points, motions
+    )
     slip = pairs.displacement(dx[step.rows]) - pairs.along(moved)
     before, slip_before = by_vertex(step.rows, pairs.force, slip)
     slip = np.maximum(slip_before, slip_after)

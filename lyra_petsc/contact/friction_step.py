@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.contact import friction_pairs
+from lyra_petsc.contact.body_motions import BodyMotions
 from lyra_petsc.contact.contact_setup import HALFWAY_CURVATURE
 from lyra_petsc.contact.obstacle_points import obstacle_loads
 from lyra_petsc.contact.pairs import FrictionPairs, Rows, chosen
-
-Motions = list[tuple[Array, Array]]
-"""Rotation (3, 3) and translation (3,) [m] of each obstacle."""
 
 MAX_ELASTIC_SLIP = 0.01
 """Largest slip of a sticking pair over the gap. If the kinetic coefficient is below the static one, all pairs
@@ -28,21 +26,19 @@ as the barrier halfway through the gap sheets rotate by much, and Newton's metho
 many iterations."""
 
 
-def moved_pairs(pairs: FrictionPairs, motions: Motions) -> FrictionPairs:
+def moved_pairs(pairs: FrictionPairs, motions: BodyMotions) -> FrictionPairs:
     """The pairs after the obstacles have moved, if they stick: contact points move with them, and their slip
     turns.
     """
-    moving = [
-        n for n, (rotation, shift) in enumerate(motions) if shift.any() or (rotation != np.eye(3)).any()
-    ]
+    moving = [number for number in np.unique(pairs.obstacle) if number >= 0 and motions.moves(number)]
     if not moving:
         return pairs
     slip, start, contact_point = pairs.slip.copy(), pairs.start.copy(), pairs.contact_point.copy()
     for obstacle in moving:
-        rotation, shift = motions[obstacle]
         rows = np.flatnonzero(pairs.obstacle == obstacle)
         side, place = pairs.beta[rows].sum(axis=1), pairs.contact_point[rows]
-        contact_point[rows], slip[rows] = place @ rotation.T + shift, pairs.slip[rows] @ rotation.T
+        contact_point[rows], rotation = motions.carried(obstacle, place, pairs.body_points[rows])
+        slip[rows] = np.einsum("eij,ej->ei", rotation, pairs.slip[rows])
         displacement = side[:, None] * (contact_point[rows] - place)
         start[rows] += np.einsum("eck,ek->ec", pairs.tangents[rows], displacement)
     return pairs._replace(slip=slip, start=start, contact_point=contact_point)
@@ -80,7 +76,7 @@ class StepFriction(NamedTuple):
         """The friction of these pairs after a motion."""
         return self._replace(pairs=pairs, offset=pairs.along(pairs.slip) - pairs.start)
 
-    def moved(self, motions: Motions) -> StepFriction:
+    def moved(self, motions: BodyMotions) -> StepFriction:
         """The friction after the obstacles have moved."""
         pairs = moved_pairs(self.pairs, motions)
         return self if pairs is self.pairs else self.with_pairs(pairs)

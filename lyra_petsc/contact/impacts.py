@@ -69,7 +69,7 @@ def _damp(step: StepEnd, barrier: ContactBarrier, contacts: Contacts) -> tuple[C
     stiffness, pairs = barrier.contact_stiffness(contacts), (rows, beta, contacts.obstacle)
     mass = _pair_masses(step, rows, np.abs(beta), stiffness)
     rate = np.einsum("ei,eik,ek->e", beta, step.v[rows], contacts.normal)
-    velocity = barrier.obstacles.contact_velocities(step.x, step.v, *pairs, step.last_times)
+    velocity = barrier.obstacles.contact_velocities(step.x, step.v, *pairs, contacts.points, step.last_times)
     approach = np.einsum("ek,ek->e", velocity, contacts.normal)
     q = 2.0 * dt * np.sqrt(stiffness / np.maximum(mass, np.finfo(float).tiny))
     push = np.maximum(mass * np.expm1(-q) * (rate - approach) / dt, -contacts.force)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import surface_shares
+from lyra_petsc.contact.body_motions import BodyMotions
 from lyra_petsc.contact.pairs import ActiveAt, Rows
 from lyra_petsc.mesh.obstacles import Container, Solid
 
@@ -24,8 +25,8 @@ class ObstaclePositions(NamedTuple):
     ----------
     start, end : (m, 3)
         Points of all obstacles [m], and normals of planes, at the start and the end of the step.
-    motions : list of (3, 3) and (3,)
-        Rotation and translation [m] of each obstacle in the step.
+    motions : BodyMotions
+        Motions of the obstacles in the step.
     act : bool
         Whether contact is part of the equations of the step.
     active : ActiveAt or None
@@ -34,7 +35,7 @@ class ObstaclePositions(NamedTuple):
 
     start: Array
     end: Array
-    motions: list[tuple[Array, Array]]
+    motions: BodyMotions
     act: bool
     active: ActiveAt | None = None
 
@@ -128,7 +129,12 @@ class Obstacles:
             np.concatenate([empty, *part]).astype(np.int64) for part in parts.values()
         )
         self.radius, self.n_points = radius, first
-        self.moving = any(obstacle.motion is not None for obstacle in obstacles)
+        self.moving = any(obstacle.moves for obstacle in obstacles)
+        deforming = (n for n, obstacle in enumerate(obstacles) if obstacle.deformation is not None)
+        self._deforming = tuple(deforming)
+        self._triangle_of = np.zeros((first, 3), dtype=np.int64)
+        for corner in range(3 if self._deforming else 0):
+            self._triangle_of[self.triangles[:, corner]] = self.triangles[:, :3]
         self._first = np.array(begins, dtype=np.int64)
         self.places = {body.name: (number, begins[number]) for number, body in enumerate(obstacles)}
         self._at_rest = [(np.eye(3), np.zeros(3))] * len(obstacles)
@@ -149,9 +155,7 @@ class Obstacles:
 
     def in_step(self, start: float, end: float, *, act: bool) -> ObstaclePositions:
         """The obstacles in a step between two times [s]."""
-        return ObstaclePositions(
-            self.positions(start), self.positions(end), self.rigid_motions(start, end), act
-        )
+        return ObstaclePositions(self.positions(start), self.positions(end), self.motions(start, end), act)
 
     def bounding_boxes(self, x: Array) -> tuple[Array, Array]:
         """Low and high corners (obstacles, 3) [m] of each obstacle over k positions x (k, m, 3) [m]."""
@@ -164,7 +168,7 @@ class Obstacles:
         """
         times, out = np.linspace(start, end, 9), np.zeros(len(self.bodies))
         for number, body in enumerate(self.bodies):
-            if body.motion is not None:
+            if body.moves:
                 first, *between, last = (body.positions(time) for time in times)
                 chord = last - first
                 square = np.maximum(np.sum(chord * chord, axis=1, keepdims=True), np.finfo(float).tiny)
@@ -174,32 +178,41 @@ class Obstacles:
                     out[number] = max(out[number], float(deviation))
         return out
 
-    def rigid_motions(self, start: float, end: float) -> list[tuple[Array, Array]]:
-        """Rotation (3, 3) and translation (3,) [m] of each from one time [s] to another."""
+    def motions(self, start: float, end: float) -> BodyMotions:
+        """The motions of all obstacles from one time [s] to another."""
         if not self.moving:
-            return self._at_rest
+            points = self.positions(start)
+            return BodyMotions(self._at_rest, (), points, points, self._triangle_of)
         motions = []
         for body in self.bodies:
             (r0, t0), (r1, t1) = body.rigid_motion(start), body.rigid_motion(end)
             rotation = r1 @ r0.T
             motions.append((rotation, t1 - rotation @ t0))
-        return motions
+        positions = self.positions(start), self.positions(end)
+        return BodyMotions(motions, self._deforming, *positions, self._triangle_of)
 
     def contact_displacements(
-        self, x: Array, points: Rows, beta: Array, obstacle: Ints, motions: list[tuple[Array, Array]]
+        self,
+        x: Array,
+        points: Rows,
+        beta: Array,
+        obstacle: Ints,
+        simplices: Ints,
+        motions: BodyMotions,
     ) -> Array:
         """Displacements (m, 3) [m] of obstacles at their contacts, times Σ β_i of the sheet's points.
 
         ``points``, ``beta`` (m, 4) and ``obstacle`` (m,) are the pairs at positions x (n_local, 3) after the
-        ``motions``; 0 for pairs between sheets, whose obstacle is −1.
+        ``motions``, and ``simplices`` (m, 4) the obstacle's points, as `BodyMotions.carried` takes them; 0
+        for pairs between sheets, whose obstacle is −1.
         """
         out = np.zeros((len(points), 3))
-        for number, (rotation, translation) in enumerate(motions if self.moving else []):
+        for number in range(len(self.bodies) if self.moving else 0):
             rows = np.flatnonzero(obstacle == number)
             sheet_beta = np.where(points[rows] >= 0, beta[rows], 0.0)
             side = sheet_beta.sum(axis=1, keepdims=True)
             contact = np.einsum("ei,eik->ek", sheet_beta, x[np.maximum(points[rows], 0)]) / side
-            out[rows] = side * (contact - (contact - translation) @ rotation)
+            out[rows] = side * motions.displacements(number, contact, simplices[rows])
         return out
 
     def contact_velocities(
@@ -209,6 +222,7 @@ class Obstacles:
         points: Ints,
         beta: Array,
         obstacle: Ints,
+        simplices: Ints,
         last: tuple[float, float],
     ) -> Array:
         """Mean velocities (m, 3) [m/s] of obstacles at their contacts between the times ``last`` [s], times Σ
@@ -221,7 +235,7 @@ class Obstacles:
             return np.zeros((len(points), 3))
         duration = last[1] - last[0]
         moved, back = (
-            self.contact_displacements(at, points, beta, obstacle, self.rigid_motions(*times))
+            self.contact_displacements(at, points, beta, obstacle, simplices, self.motions(*times))
             for at, times in ((x, last), (x - duration * v, last[::-1]))
         )
         return 0.5 * (moved - back) / duration

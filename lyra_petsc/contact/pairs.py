@@ -99,6 +99,8 @@ class Contacts(NamedTuple):
         Normal force [N], > 0, and distance less offset [m].
     obstacle : (m,)
         Number of the obstacle, −1 between sheets.
+    points : (m, 4)
+        Of the near pairs, as in `BarrierPairs`.
     """
 
     pair: Ints
@@ -109,6 +111,7 @@ class Contacts(NamedTuple):
     force: Array
     distance: Array
     obstacle: Ints
+    points: Ints
 
 
 class FrictionPairs(NamedTuple):
@@ -156,6 +159,11 @@ class FrictionPairs(NamedTuple):
     def obstacle(self) -> Ints:
         """Number of the obstacle, −1 between sheets, (E,)."""
         return self.key[:, 5]
+
+    @property
+    def body_points(self) -> Ints:
+        """~number of the obstacle's points, 0 for vertices of sheets, (E, 4)."""
+        return self.key[:, 6:]
 
     def along(self, vectors: Array) -> Array:
         """Tangential components (E, 2) of vectors (E, 3)."""

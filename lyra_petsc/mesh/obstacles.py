@@ -33,11 +33,21 @@ MotionFactory: TypeAlias = type[Any]
 """`terms.motion.Motion`, which this package must not import."""
 
 
-class _RigidBody:
-    """A body that moves rigidly from its position at t = 0: by T(t) T(0)⁻¹ for a rigid motion T."""
+PointMotion: TypeAlias = Callable[[float], Array]
+"""Points (n, 3) [m] of a body that deforms, at a time [s]."""
+
+
+class _MovingBody:
+    """A body that deforms, or moves rigidly from its place at t = 0: by T(t) T(0)⁻¹ for a rigid motion T."""
 
     points: Array
     motion: RigidMotion | None
+    deformation: PointMotion | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves or deforms."""
+        return self.motion is not None or self.deformation is not None
 
     def rigid_motion(self, time: float) -> tuple[Array, Array]:
         """Rotation (3, 3) and translation (3,) [m] from t = 0 to a time [s]."""
@@ -49,6 +59,8 @@ class _RigidBody:
 
     def positions(self, time: float) -> Array:
         """Its points (n, 3) [m] at a time [s]; ``points`` itself if it does not move."""
+        if self.deformation is not None:
+            return self.deformation(time)
         if self.motion is None:
             return self.points
         rotation, translation = self.rigid_motion(time)
@@ -56,7 +68,7 @@ class _RigidBody:
 
 
 @dataclass(frozen=True, eq=False)
-class Solid(_RigidBody):
+class Solid(_MovingBody):
     """An obstacle that sheets stay outside of.
 
     Attributes
@@ -74,7 +86,9 @@ class Solid(_RigidBody):
     friction : (float, float)
         Static and kinetic coefficient.
     motion : RigidMotion or None
-        None: it does not move.
+        None: it does not move as a rigid body.
+    deformation : PointMotion or None
+        None: it does not deform.
     """
 
     name: str
@@ -84,10 +98,11 @@ class Solid(_RigidBody):
     radius: float
     friction: tuple[float, float]
     motion: RigidMotion | None = None
+    deformation: PointMotion | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Container(_RigidBody):
+class Container(_MovingBody):
     """A convex region that all vertices stay inside of.
 
     Attributes

@@ -133,7 +133,7 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
         return []
     surfaces = []
     for obstacle, spec in zip(run_obstacles(run), scene.obstacles.values(), strict=True):
-        fixed = obstacle.motion is None
+        fixed = not obstacle.moves
         if spec.plane is not None:
             assert isinstance(obstacle, Container)
             tangents, half = _tangents(obstacle.normals[0]), 0.5 * PLANE_SIZE * size
@@ -154,6 +154,8 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
 
 
 def _moved_points(obstacle: Solid | Container, points: Array, time: float) -> Array:
+    if obstacle.deformation is not None:
+        return obstacle.deformation(time)
     rotation, translation = obstacle.rigid_motion(time)
     return points @ rotation.T + translation
 
