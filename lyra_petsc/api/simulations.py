@@ -335,9 +335,9 @@ class Simulation:
             raise InputError(f"must be {_shape(curve.values[0])}, not {shown(value)}", key=name)
         time = run.time if at is None else self._time_of(at)
         curve.go_to(number, run.time, time)
-        run.expect_jump(run.time)
-        if at is not None:
-            run.expect_jump(time)
+        if at is None:
+            run.expect_jump(run.time)
+        else:
             run.follow_driven(time)
 
     def _driven_as(self, name: str, kind: type[Any], call: str) -> Any:

@@ -28,7 +28,6 @@ from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.scene.time_curve import TimeCurve
 from lyra_petsc.scene.values import AXES
 from lyra_petsc.stepping.initial_state import check_resolved, start_positions, start_velocities
 from lyra_petsc.stepping.integrators import integrator_of
@@ -188,9 +187,7 @@ def event_times(scene: Scene) -> list[float]:
         if window.start < t < window.until + window.fade
     ]
     windows += [Window(load.start, load.until) for load in scene.loads]
-    amounts = [load.chamber.amount for load in scene.loads if load.chamber is not None]
-    kinks = [t for amount in amounts if amount is not None for t in TimeCurve.of(amount).kinks]
-    return [*(t for window in windows for t in window.events()), *jumps, *kinks]
+    return [*(t for window in windows for t in window.events()), *jumps]
 
 
 def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem, GlobalMesh]:

@@ -90,6 +90,40 @@ def test_a_driven_obstacle_is_one_with_keyframes(comm: Any) -> None:
         np.testing.assert_allclose(reached[0], expected[0], atol=1e-9)
 
 
+VALUES: dict[str, tuple[Any, Any]] = {
+    "gravity": (lambda value: {"gravity": value}, [0.0, 1.0, -9.0]),
+    "wind.velocity": (lambda value: {"wind": {"velocity": value, "density": 1.2}}, [0.0, 1.0, 4.0]),
+    "loads[0].pressure": (lambda value: {"loads": [{"pressure": value}]}, 3.0),
+    "loads[0].force": (lambda value: {"loads": [{"nodes": [24], "force": value}]}, [0.0, 0.01, 0.02]),
+    "loads[0].moment": (lambda value: {"loads": [{"group": "top", "moment": value}]}, 1e-4),
+}
+"""Keys that change a scene, and a typical value of each."""
+
+
+@pytest.mark.parallel(2)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("name", VALUES)
+def test_a_driven_value_is_a_curve(comm: Any, name: str, integrator: str) -> None:
+    keys, size = VALUES[name]
+    points = [[round(0.01 * n, 2), (np.array(size) * (n * (4 - n) / 5)).tolist()] for n in range(6)]
+    scene = scene_with(integrator, material=SCENE["material"] | {"bending_model": "midedge"})
+    scene["time"] = scene["time"] | {"end": 0.05}
+    del scene["gravity"]
+    with lyra_petsc.Simulation(scene | keys(points)) as twin:
+        energies = [step.energies for step in twin]
+        expected = ends(twin)
+    with lyra_petsc.Simulation(scene | keys(points[0][1]), drives=[name]) as driven:
+        for time, value in points[1:]:
+            driven.set(name, value, at=time)
+            while driven.time < time:  # steps may be halved
+                step = driven.step()
+        reached = ends(driven)
+    if comm.rank == 0:
+        np.testing.assert_allclose(reached[0], expected[0], atol=1e-10)
+        assert np.abs(expected[1]).max() > 1e-3
+    assert step.energies == pytest.approx(energies[-1], rel=1e-6, abs=1e-12)
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_restored_state_goes_on_as_the_saved_one(comm: Any, integrator: str) -> None:
