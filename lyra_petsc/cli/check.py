@@ -111,6 +111,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints, tables: list[tuple
         ("active terms", ", ".join(whole.terms)),
         ("handles", str(len(scene.handles))),
         *_curves(scene),
+        *_creases(simulation),
         *_contact(scene, whole.barrier.gap if whole.barrier else 0.0),
         *tables,
         ("unknowns", f"{problem.points.n_unknowns} (velocities)"),
@@ -161,6 +162,17 @@ def _curves(scene: Scene) -> list[tuple[str, str]]:
         (one_line(key), f"{curve}; steps end at its {len(curve.kinks)} kinks")
         for key, curve in curves(scene).items()
     ]
+
+
+def _creases(simulation: SteppedScene) -> list[tuple[str, str]]:
+    """Rows of the plan about creases."""
+    mesh, scene = simulation.problem.mesh, simulation.scene
+    if not scene.creases:
+        return []
+    from lyra_petsc.terms import creases  # imported only where it is needed
+
+    assert mesh is not None
+    return [(one_line(name), text) for name, text in creases.plan(RestShape(scene, mesh))]
 
 
 def _sandbox(scene: Scene) -> list[tuple[str, str]]:

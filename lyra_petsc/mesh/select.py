@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lyra_petsc.arrays import Ints
+from lyra_petsc.arrays import Ints, Mask
 from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.mesh.mesh import Group, Mesh
@@ -66,6 +66,21 @@ def select_triangles(mesh: Mesh, group: str | None, *, key: str, file: object | 
             file=file,
         )
     return surface.triangles
+
+
+def in_group(mesh: Mesh, edges: Ints, group: str, *, key: str, file: object | None = None) -> Mask:
+    """Whether edges (n, 2) of the mesh are in a group, (n,): in one of curves; of others with both ends.
+
+    Raises
+    ------
+    InputError
+        Unknown group.
+    """
+    named = find_group(mesh, group, key=key, file=file)
+    if named.dimension != 1:
+        return np.asarray(np.isin(edges, named.vertices).all(axis=1))
+    keys = [pairs.min(axis=1) * mesh.n_vertices + pairs.max(axis=1) for pairs in (edges, named.edges)]
+    return np.isin(*keys)
 
 
 def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -> Group:

@@ -29,6 +29,7 @@ from lyra_petsc.errors import suggest
 from lyra_petsc.scene.attachment_block import Attachment
 from lyra_petsc.scene.block import BY_KIND, Block
 from lyra_petsc.scene.camera_block import Render
+from lyra_petsc.scene.crease_block import Crease
 from lyra_petsc.scene.fit_block import Fit
 from lyra_petsc.scene.gas_block import Gas, Liquid
 from lyra_petsc.scene.material_block import Material
@@ -837,6 +838,8 @@ class Scene(Block):
         Rigid obstacles, by name.
     loads : list of AppliedLoad
         Forces, pressures, tractions, moments and enclosed volumes.
+    creases : list of Crease
+        Edges with rest angles and a stiffness of their own.
     initial : Initial or None
         Initial velocities and noise; without this key the scene starts at rest.
     time : Time
@@ -866,6 +869,7 @@ class Scene(Block):
     contact: Contact | None = None
     obstacles: Annotated[dict[Name, Obstacle], block_of("names")] | None = None
     loads: Annotated[list[AppliedLoad], list_of()] = Field(default_factory=list)
+    creases: Annotated[list[Crease], list_of()] = Field(default_factory=list)
     initial: Initial | None = None
     time: Time
     output: Output = Field(default_factory=Output)

@@ -208,6 +208,13 @@ REGISTRY: list[Registration] = [
         module_name=".bending.hinge_clamp",
     ),
     Registration(
+        "creases",
+        lambda scene, shells: bool(scene.creases),
+        Role.ELASTIC,
+        BENDING,
+        damped=True,
+    ),
+    Registration(
         "chambers",
         lambda scene, shells: any(load.chamber for load in scene.loads),
         Role.ELASTIC,

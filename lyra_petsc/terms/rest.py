@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.measures import rest_matrices
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.mesh.select import select_triangles
+from lyra_petsc.mesh.select import in_group, select_triangles
 from lyra_petsc.mesh.topology import Hinges, hinges, junctions, unique_edges
 from lyra_petsc.scene.materials.library import ShellMaterial, resolve_material
 from lyra_petsc.scene.schema import Scene
@@ -112,6 +112,46 @@ class RestShape:
         """The edges with two triangles, computed when a term first needs them."""
         self._check_junctions()
         return hinges(self.mesh.triangles)
+
+    @cached_property
+    def crease_of(self) -> NDArray[np.int64]:
+        """Number (H,) of the crease of the scene that each of the ``hinges`` is in, −1 for none.
+
+        Raises
+        ------
+        InputError
+            Unknown group, an edge in two creases, or a material that slides or yields by curvature at it.
+        """
+        crease, scene = np.full(len(self.hinges.vertices), -1, dtype=np.int64), self.scene
+        for number, block in enumerate(scene.creases):
+            key = f"creases[{number}].group"
+            chosen = in_group(self.mesh, self.hinges.vertices[:, :2], block.group, key=key, file=scene.source)
+            twice = np.flatnonzero(chosen & (crease >= 0))
+            if len(twice):
+                a, b = self.hinges.vertices[twice[0], :2]
+                raise InputError(
+                    f"the edge of vertices {a} and {b} is in '{block.group}' and in creases"
+                    f"[{crease[twice[0]]}] '{scene.creases[crease[twice[0]]].group}'; give it one crease",
+                    file=scene.source,
+                    key=key,
+                )
+            slides = np.array(
+                [
+                    max(shell.friction_moment) > 0.0
+                    or (shell.bends_with("midedge") and np.isfinite(shell.yield_curvature))
+                    for shell in self.shells
+                ]
+            )[self.shell_of]
+            if slides[self.hinges.triangles[chosen]].any():
+                raise InputError(
+                    f"'{block.group}' lies in a material with friction_moment or yield_curvature, which "
+                    "bending_model: midedge has no law for beside a crease; leave these out, or for "
+                    "yield_curvature take bending_model: hinge",
+                    file=scene.source,
+                    key=key,
+                )
+            crease[chosen] = number
+        return crease
 
     def _check_junctions(self) -> None:
         """Refuse edges of more than two triangles, for which a hinge's angle is undefined."""

@@ -39,6 +39,9 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
         ]
     },
     "spring": {"handles": [{"nodes": [1, 5, 9], "stiffness": 300.0}, {"nodes": [9, 10], "stiffness": 50.0}]},
+    "creases": {
+        "creases": [{"group": "sheet", "angle": 40.0, "stiffness": 0.02}],
+    },
     "chambers": {
         "loads": [
             {"gas": {"group": ["roof", "wall"], "pressure": 900.0, "ambient": 3000.0}},

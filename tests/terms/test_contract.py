@@ -34,8 +34,8 @@ pytestmark = pytest.mark.quick
 #: terms with targets in space: not invariant under rigid motions, and their forces do not sum to zero
 ANCHORED = {"clamp", "clamp_plasticity", "spring"}
 
-#: terms with forces in the start shape (test_chambers.py)
-FILLED = {"chambers"}
+#: terms with forces in the start shape (test_chambers.py; test_creases.py)
+FILLED = {"chambers", "creases"}
 
 #: all but terms with changing stencils, which have no elements at rest (test_contact_pairs.py and others)
 FIXED = [entry for entry in REGISTRY if not entry.of_contact]

@@ -494,6 +494,8 @@ def elements(rest: RestShape) -> Elements:
         rest_tangent[:] = np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
         _check_rest_curvature(rest_tangent, rest, chosen, size)
     director = mean_directors(mesh.positions, triangles, number, n_edges, rest_rotation)
+    if rest.scene.creases:
+        _release_creases(form, director, rest, chosen, number, rest_rotation)
     _align_with_symmetry(director, rest, triangles, number, mesh.positions)
     director = director[number]
     _check_folds(_angles_at(mesh.positions, triangles, director) - angle, number, edges, rest)
@@ -513,6 +515,38 @@ def elements(rest: RestShape) -> Elements:
         "damping": rest.per_triangle("damping")[chosen],
     }
     return Elements(triangles, data, edges=number)
+
+
+def _release_creases(
+    form: Array, director: Array, rest: RestShape, chosen: Ints, number: Ints, rotation: Array
+) -> None:
+    """Let triangles ``chosen`` (F,) with edges ``number`` (F, 3) end at creases as at free edges, in place.
+
+    Each of the two triangles at a crease would have a director of its own there, which its forms (F, 3, 3)
+    no longer contain: they are those of the remaining edges, least over that director. The one director
+    (n_edges, 3) that there is turns with the first triangle, whose form keeps its square alone, and is
+    without energy in equilibrium.
+    """
+    quad, faces = rest.hinges.vertices, rest.hinges.triangles
+    keys = rest.edges[:, 0] * rest.mesh.n_vertices + rest.edges[:, 1]
+    low, high = np.sort(quad[rest.crease_of >= 0, :2], axis=1).T
+    creased = np.isin(number, np.searchsorted(keys, low * rest.mesh.n_vertices + high))
+    first = np.zeros(len(rest.edges), dtype=np.int64)
+    first[np.searchsorted(keys, low * rest.mesh.n_vertices + high)] = faces[rest.crease_of >= 0, 0]
+    for triangle in np.flatnonzero(creased.any(axis=1)):
+        gone = creased[triangle]
+        whole, kept = form[triangle].copy(), np.flatnonzero(~gone)
+        gone = np.flatnonzero(gone)
+        form[triangle] = 0.0
+        to_gone = np.linalg.solve(whole[np.ix_(gone, gone)], whole[np.ix_(gone, kept)])
+        form[triangle][np.ix_(kept, kept)] = whole[np.ix_(kept, kept)] - whole[np.ix_(kept, gone)] @ to_gone
+        for side in gone[first[number[triangle, gone]] == chosen[triangle]]:
+            form[triangle, side, side] = whole[side, side]
+    x, triangles = rest.mesh.positions, rest.mesh.triangles[chosen]
+    sides = creased & (first[number] == chosen[:, None])
+    own = np.where(sides, number, len(rest.edges))
+    alone = mean_directors(x, triangles, own, len(rest.edges) + 1, rotation)
+    director[number[sides]] = alone[number[sides]]
 
 
 def _align_with_symmetry(director: Array, rest: RestShape, triangles: Ints, number: Ints, x: Array) -> None:
