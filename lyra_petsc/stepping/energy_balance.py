@@ -19,7 +19,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import kinetic_energy
 from lyra_petsc.stepping.time_step import Evaluation
 from lyra_petsc.terms.energies import ENERGIES
-from lyra_petsc.terms.protocols import Dissipates, MovingTargets, PullsHandles
+from lyra_petsc.terms.protocols import Dissipates, GlobalSums, MovingTargets, PullsHandles
 from lyra_petsc.terms.term import Load
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
@@ -74,6 +74,8 @@ class StepAccount:
         Heat of all dampers; of material damping, and of friction within the fabric.
     inertia : float
         ½ ‖Δv‖²_M of a step of backward Euler, with the velocities that solve it.
+    early : float
+        What the external work would be more if gas were let in before the sheet moves, as in the identity.
     """
 
     before: Budget
@@ -87,6 +89,7 @@ class StepAccount:
     damping_heat: float
     fabric_heat: float
     inertia: float
+    early: float = 0.0
 
     @property
     def change(self) -> float:
@@ -96,7 +99,7 @@ class StepAccount:
     @property
     def bracket(self) -> float:
         """The bracket of backward Euler's identity: what works, heat and ½ ‖Δv‖²_M leave of the change."""
-        return self.change + self.heat - self.external + self.inertia
+        return self.change + self.heat - self.external - self.early + self.inertia
 
 
 def _work_of(force: Array, x_before: Array, x: Array) -> float:
@@ -155,6 +158,24 @@ def _move_targets_to_end(equations: StageEquations) -> float:
     frozen = active.with_targets(step.frozen, equations.targets_at(step.end))
     equations.change(frozen=frozen)
     return active.moving_energy(equations.x, frozen) - active.moving_energy(equations.x, step.frozen)
+
+
+def _early_work(equations: StageEquations) -> float:
+    """What the work on this rank's enclosed volumes is more if gas is let in before and after the sheet
+    moves, up to and from the stage, than if it is let in as the sheet moves (trapezoidal rule).
+
+    The pressure of gas that is let in falls at once as the sheet gives way.
+    """
+    step, terms = equations.step, [t for t in equations.active.targets if isinstance(t, GlobalSums)]
+    early = 0.0
+    for term in terms:
+        start, end = (term.freeze(equations.targets_at(time)) for time in (step.start, step.end))
+        (at_start, before, to_end), (from_start, after, at_end) = (
+            [float(term.energies(x, frozen).sum()) for frozen in (start, step.frozen[term], end)]
+            for x in (step.x, equations.x)
+        )
+        early += before - at_start + at_end - after - 0.5 * (to_end - at_start + at_end - from_start)
+    return early
 
 
 class EnergyBalance:
@@ -255,6 +276,7 @@ class EnergyBalance:
                 0.5 * float(np.vdot(pull + pull0, at - at0))
                 for (at0, pull0), (at, pull) in zip(targets, self._ends[1], strict=True)
             )
+        early = _early_work(equations) if self._ends is None else 0.0
         by_targets += _move_targets_to_end(equations)
         work = _work_of(external, x_before, equations.x) + by_targets
         work += _work_besides_stage(equations, x_before)
@@ -266,18 +288,18 @@ class EnergyBalance:
             equations.mass, equations.evaluated.v[: len(equations.mass)] - equations.step.v_h
         )
         before, moving_before = self.budget, self._moving_energy
-        local = work, damped, fabric, impacts, by_obstacles, at_start, inertia
+        local = work, damped, fabric, impacts, by_obstacles, at_start, inertia, early
         energies, moving, sums = self._measured(here, *local)
-        work, damped, fabric, impacts, by_obstacles, at_start, inertia = sums
+        work, damped, fabric, impacts, by_obstacles, at_start, inertia, early = sums
         if self._ends is None:  # a handle does work on the sheet through targets that move with it
-            work -= moving_before
+            work -= moving_before + early
         heat = damped + fabric + impacts
         after = Budget(
             **energies, external_work=before.external_work + work, dissipation=before.dissipation + heat
         )
         works = work, by_obstacles, at_start
         self.account = StepAccount(
-            before, after, moving_before, moving, *works, heat, damped, fabric, inertia
+            before, after, moving_before, moving, *works, heat, damped, fabric, inertia, early
         )
         return self.account
 
