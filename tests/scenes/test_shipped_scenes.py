@@ -9,16 +9,19 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
-from physics import finished
+from physics import finished, stepped
 
 from lyra_petsc.contact.crossings import self_crossings
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.chambers import Chambers
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = (
     "ball",
+    "balloon",
     "buckle",
+    "cushion",
     "drape",
     "flag",
     "paper",
@@ -57,6 +60,48 @@ def test_a_turning_ball_rotates_its_cloth() -> None:
     assert len(crossings) == 0
     assert np.linalg.norm(x, axis=1).min() > 0.3
     assert columns["smallest_gap"] > 0.0
+
+
+def filling(simulation: SteppedScene) -> tuple[float, float, float]:
+    """Volume [m³], pressure [Pa] and amount of the gas."""
+    term, here = simulation.problem.terms["chambers"], simulation.problem.equations.here()
+    assert isinstance(term, Chambers)
+    ((_, volume, pressure, amount),) = term.table_rows(here.x, here.frozen[term])
+    return float(volume), float(pressure), float(amount)
+
+
+def test_the_balloon_has_passed_its_largest_pressure() -> None:
+    with simulated("balloon", "mesh.size=0.02") as simulation:
+        volume, pressure, _ = filling(simulation)
+    # a free sphere has 1239 Pa at its limit point and 760 Pa at the end, at the stretch 2.6
+    assert volume == pytest.approx(20.0 * 0.00413 * 101325.0 / (101325.0 + pressure), rel=1e-3)
+    assert pressure == pytest.approx(770.0, abs=40.0)
+
+
+def test_the_pressed_cushion_keeps_its_gas_and_the_balance_of_energies() -> None:
+    scene = load_scene(CONFIGS / "cushion.yaml", ("mesh.size=0.06", "time.step=0.01", "time.end=1.1"))
+    path, work, relaxed = [], 0.0, None
+    with stepped(MPI.COMM_SELF, scene) as simulation:
+        while not simulation.finished:
+            simulation.step()
+            path.append(filling(simulation))
+            account = simulation.energy_balance.account
+            if simulation.time > 0.505:  # the plate works, by the mean of its forces at both ends of a step
+                relaxed = relaxed or account.before
+                work += account.external + 0.5 * (account.obstacle_work_at_start - account.obstacle_work)
+        pressed = simulation.budget
+        floor, plate = simulation.energy_balance.obstacle_forces(2)[:, 2]
+    volume, pressure, amount = np.array(path).T
+    constant = (pressure + 101325.0) * (volume / amount) ** 1.4
+    np.testing.assert_allclose(constant, 101325.0 * 0.0048**1.4, rtol=1e-6)
+    # in equilibrium at the end, both plates carry the pressure, and the floor also the weight
+    weight = 9.81 * float(simulation.problem.equations.mass.sum())
+    assert plate > 400.0
+    assert -floor - plate == pytest.approx(weight, rel=1e-3)
+    assert relaxed is not None
+    stored, heat = pressed.total - relaxed.total, pressed.dissipation - relaxed.dissipation
+    assert pressed.more["gas_energy"] - relaxed.more["gas_energy"] > 1.0
+    assert 0.0 < work - stored - heat < 0.03 * work  # lost by backward Euler
 
 
 def test_every_shipped_scene_is_tested() -> None:

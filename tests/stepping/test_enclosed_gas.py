@@ -22,10 +22,10 @@ pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 FABRIC = {"density": 0.2, "membrane": {"c11": 2000.0, "c22": 2000.0, "c12": 600.0, "c33": 700.0}}
 RUBBER = {"young": 1e6, "poisson": 0.5, "thickness": 3e-4, "density": 1000.0, "law": "neo-hookean"}
 
-LOSSES = {"midpoint": 1e-4, "alpha2": 0.005, "bdf2": 0.05}
-"""Largest error [J] of the balance of energies; the surface rings as the gas is let go."""
+LOSSES = {"midpoint": 5e-5, "alpha2": 5e-4, "bdf2": 5e-4}
+"""Largest error [J] of the balance of energies."""
 
-PUMPED = [[0.0, 1.0], [0.05, 1.02], [0.2, 1.0]]
+PUMPED = [[0.0, 1.0], [0.05, 1.05], [0.2, 1.02]]
 
 
 def ball(comm: MPI.Comm, folder: Path, n: int = 4, radius: float = 0.5) -> dict[str, Any]:
@@ -49,7 +49,7 @@ def inflated(comm: MPI.Comm, folder: Path, integrator: str, step: float = 0.005)
         "mesh": ball(comm, folder),
         "material": FABRIC | {"bending": 1e-4, "damping": 0.002},
         "gravity": [0.0, 0.0, -9.81],
-        "loads": [{"gas": {"pressure": 100.0, "ambient": 5000.0, "amount": PUMPED}}],
+        "loads": [{"gas": {"pressure": 0.0, "ambient": 5000.0, "amount": PUMPED}}],
         "time": {"end": 0.1, "step": step, "integrator": integrator},
     }
 
@@ -62,18 +62,18 @@ def test_gas_keeps_its_law_and_the_balance_of_energies(
     for step in (0.004, 0.002):
         simulation = SteppedScene(comm, scene_of(inflated(comm, shared_tmp, integrator, step)))
         ((first, pressure, _),) = rows(simulation)
-        assert pressure == pytest.approx(100.0)
+        assert abs(pressure) < 1e-9
         start = simulation.budget.total
         while not simulation.finished:
             simulation.step()
         ((volume, pressure, amount),) = rows(simulation)
         budget = simulation.budget
         simulation.destroy()
-        assert amount == pytest.approx(1.02 - 0.02 * 0.05 / 0.15)
-        expected = (amount * first / volume) ** 1.4 * 5100.0 - 5000.0
+        assert amount == pytest.approx(1.04)
+        expected = (amount * first / volume) ** 1.4 * 5000.0 - 5000.0
         assert pressure == pytest.approx(expected, rel=1e-6)
         lost.append(start + budget.external_work - budget.dissipation - budget.total)
-    assert 0.3 < budget.external_work < 0.4  # of pumping
+    assert budget.external_work == pytest.approx(0.976, abs=0.005)  # of pumping
     if integrator in LOSSES:
         assert abs(lost[1]) < LOSSES[integrator]
     else:  # of first order
@@ -92,9 +92,16 @@ def test_ranks_agree_and_a_run_goes_on_on_another_number(
         np.testing.assert_allclose(x, shape(alone), rtol=0.0, atol=1e-6)
         np.testing.assert_allclose(of_gas, rows(alone), rtol=1e-4)
         assert columns["gas_energy"] == pytest.approx(alone.energy_balance.columns()["gas_energy"], rel=1e-4)
-    resumed = end_on_one_rank(comm, scene, shared_tmp / "run", 7)
+    folder = shared_tmp / "run"
+    resumed = end_on_one_rank(comm, scene, folder, 7)
     if resumed is not None:
         np.testing.assert_allclose(resumed, x, rtol=0.0, atol=1e-6)
+        lines = (folder / "volumes.csv").read_text().splitlines()
+        assert lines[0] == "step,time,name,volume,pressure,amount"
+        assert [int(line.split(",")[0]) for line in lines[1:]] == list(range(len(lines) - 1))
+        assert len(lines) - 1 > 8
+        volumes = np.array([line.split(",")[3:] for line in lines[1:]], dtype=np.float64)
+        np.testing.assert_allclose(volumes[-1], of_gas[0], rtol=1e-4)
 
 
 def balloon(comm: MPI.Comm, folder: Path, n: int, end: float) -> dict[str, Any]:
