@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from closed_surfaces import sphere, walled_box
 from mpi4py import MPI
-from physics import end_on_one_rank, finished, obj_file, scene_of, shape
+from physics import end_on_one_rank, finished, obj_file, scene_of, shape, stepped
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.scene.schema import INTEGRATORS
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.stepping.statics.stability import Examination
 from lyra_petsc.terms.chambers import Chambers
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
@@ -165,3 +166,56 @@ def test_two_chambers_share_a_wall(comm: MPI.Comm, shared_tmp: Path) -> None:
     assert 40.0 > p1 > p2 > 0.0
     assert (p1 + 5000.0) * left**1.4 == pytest.approx(5040.0, rel=1e-9)
     assert (p2 + 5000.0) * right**1.4 == pytest.approx(5000.0, rel=1e-9)
+
+
+def test_gas_stabilises_a_balloon_beyond_its_limit_point(
+    comm: MPI.Comm, shared_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # by its amount it is stable; at constant pressure, without the part of rank one, it would swell
+    with finished(comm, balloon(comm, shared_tmp, 6, 6.0)) as simulation:
+        equations, size = simulation.problem.equations, simulation.problem.whole.size
+        with Examination(equations, size) as examination:
+            with_gas = examination.stability
+        monkeypatch.setattr(equations.forces, "dense_part", lambda at: None)
+        with Examination(equations, size) as examination:
+            without = examination.stability
+    assert with_gas.negative == 0
+    assert without.negative == 1
+
+
+@pytest.mark.parametrize("options", [{"pc_type": "mg"}, {"pc_type": "pbjacobi"}])
+def test_gas_takes_few_more_iterations_than_pressure(
+    comm: MPI.Comm, options: dict[str, str], shared_tmp: Path
+) -> None:
+    iterations = []
+    content = {
+        "mesh": ball(comm, shared_tmp, 16),
+        "material": FABRIC | {"membrane": {"c11": 2e4, "c22": 2e4, "c12": 6e3, "c33": 7e3}},
+        "gravity": [0.0, 0.0, -9.81],
+        "handles": [{"box": [[-1, -1, 0.4], [1, 1, 1]]}],
+        "time": {"end": 0.05, "step": 0.01},
+        "solver": {},
+    }
+    for load in ({"pressure": 100.0}, {"gas": {"pressure": 100.0}}):
+        with stepped(comm, content | {"loads": [load]}, **options) as simulation:
+            steps = []
+            while not simulation.finished:
+                steps.append(simulation.step())
+        iterations.append(sum(step.linear_iterations for step in steps))
+    assert iterations[1] <= 1.5 * iterations[0]
+
+
+def test_a_sphere_of_water_keeps_its_volume(comm: MPI.Comm, shared_tmp: Path) -> None:
+    content = inflated(comm, shared_tmp, "beuler") | {
+        "loads": [{"liquid": {}}],
+        "handles": [{"box": [[-1, -1, 0.3], [1, 1, 1]]}],
+    }
+    with stepped(comm, content) as simulation:
+        ((start, _, amount),) = rows(simulation)
+        assert amount == pytest.approx(start, rel=1e-12)
+        while not simulation.finished:
+            simulation.step()
+        ((volume, pressure, _),) = rows(simulation)
+    assert volume == pytest.approx(start, rel=1e-6)
+    assert pressure == pytest.approx(2.2e9 * (amount - volume) / amount, rel=1e-6)
+    assert abs(pressure) > 0.1

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from closed_surfaces import sphere
 from mpi4py import MPI
-from physics import finished, grid
+from physics import finished, grid, obj_file
 
 import lyra_petsc
 from lyra_petsc.arrays import Array
@@ -253,6 +255,28 @@ def test_each_parameter_of_curved_sheets_with_directors() -> None:
 def test_membrane_laws(law: str) -> None:
     material, numbers = LAWS[law]
     agree(scene("beuler", {"damping": 0.01} | material), numbers)
+
+
+@pytest.mark.parametrize("integrator", ["static", "semi-implicit", "alpha2"])
+def test_gas_in_a_closed_volume(integrator: str, tmp_path: Path) -> None:
+    corners, triangles = sphere(3, 0.2)
+    time: dict[str, Any] = {"end": 0.04, "step": 0.01, "integrator": integrator}
+    content = {
+        "mesh": obj_file(tmp_path / "ball.obj", corners, triangles),
+        "material": PULLED["material"]
+        | {"membrane": {"c11": 600.0, "c22": 400.0, "c12": 150.0, "c33": 120.0}},
+        "handles": [
+            {"box": [[-1, -1, -1], [1, 1, -0.1]]},
+            {"box": [[-1, -1, 0.1], [1, 1, 1]], "motion": "up"},
+        ],
+        "motions": {"up": [{"time": 0}, {"time": 1.0, "translate": [0.0, 0.0, 0.01]}]},
+        "loads": [{"gas": {"pressure": 30.0, "ambient": 2000.0}}],
+        "time": {"analysis": "static"} if integrator == "static" else time,
+        "solver": TIGHT,
+        "petsc": {"ksp_rtol": 1e-13},
+    }
+    numbers = {"loads[0].gas.pressure": 30.0, "loads[0].gas.ambient": 2000.0, "material.membrane.c11": 600.0}
+    agree(lyra_petsc.load(content), numbers)
 
 
 @pytest.mark.parallel
