@@ -53,6 +53,10 @@ def nothing_acts(
         for load, at in itertools.product(active.loads, (t0, t1)):
             load.add_force(_during(t0, t1, at, start.x), force := np.zeros_like(start.x))
             acting += float(np.abs(force).max(initial=0.0))
+    for term in active.targets:
+        upcoming = (_during(at, at, at, start.x) for at in stops)
+        places = [term.targets(start.x, term.freeze(step))[0] for step in upcoming]
+        acting += sum(float(np.abs(place - places[0]).max(initial=0.0)) for place in places)
     gradient = start.forces.sum(active.elastic, start.x, start.frozen)
     acting, square = comm.allreduce(np.array([acting, float(np.vdot(gradient, gradient))]))
     if acting > 0.0 or square > floor**2:

@@ -14,7 +14,9 @@ from physics import finished, stepped
 from lyra_petsc.contact.crossings import self_crossings
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.bending.hinge import dihedral_angles
 from lyra_petsc.terms.chambers import Chambers
+from lyra_petsc.terms.creases import Creases
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = (
@@ -24,6 +26,7 @@ SHIPPED = (
     "cushion",
     "drape",
     "flag",
+    "miura",
     "paper",
     "plate",
     "sail",
@@ -102,6 +105,26 @@ def test_the_pressed_cushion_keeps_its_gas_and_the_balance_of_energies() -> None
     stored, heat = pressed.total - relaxed.total, pressed.dissipation - relaxed.dissipation
     assert pressed.more["gas_energy"] - relaxed.more["gas_energy"] > 1.0
     assert 0.0 < work - stored - heat < 0.03 * work  # lost by backward Euler
+
+
+@pytest.mark.parametrize("model", ["midedge", "hinge"])
+def test_the_miura_ori_folds_along_its_exact_kinematics(model: str) -> None:
+    # at each vertex tan ½φ' = cos γ tan ½φ, with the angles φ' of straight creases and φ of those across, the
+    # same all over the sheet (Schenk & Guest, PNAS 110 (2013) 3276-3281)
+    settings = "mesh.size=0.05", "time.step=0.25", f"material.bending_model={model}"
+    with simulated("miura", *settings) as simulation:
+        term, x = simulation.problem.terms["creases"], simulation.problem.equations.x
+        assert isinstance(term, Creases)
+        group = np.asarray(term.elements.data["crease"]).astype(np.int64)
+        angle = -np.degrees(dihedral_angles(x, term.stencil)) * np.array([1.0, -1.0, 1.0, -1.0])[group]
+        assert term.n_elements == 2 * 12 * 11
+    across = float(angle[group < 2].mean())
+    straight = np.degrees(2.0 * np.arctan(np.cos(np.radians(60.0)) * np.tan(np.radians(0.5 * across))))
+    # the rest angles, 120° and 30°, do not fit together
+    assert 90.0 < across < 100.0
+    assert 55.0 < straight < 62.0
+    np.testing.assert_allclose(angle[group < 2], across, rtol=0.0, atol=0.5)
+    np.testing.assert_allclose(angle[group >= 2], straight, rtol=0.0, atol=0.5)
 
 
 def test_every_shipped_scene_is_tested() -> None:

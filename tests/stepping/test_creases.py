@@ -170,6 +170,12 @@ class TestSelection:
         assert any("creases[0]: no edge between two triangles" in note for note in simulation.notes)
         simulation.destroy()
 
+    def test_a_sheet_that_will_be_folded_is_not_noted_as_staying_as_it_is(self, tmp_path: Path) -> None:
+        for angle, stays in ((0.0, True), (30.0, False), ([[0.0, 0.0], [0.5, 9.0], [1.0, 0.0]], False)):
+            simulation = self.built(tmp_path, [FLAT | {"angle": angle}])
+            assert any("nothing acts on the sheet" in note for note in simulation.notes) == stays
+            simulation.destroy()
+
     def test_an_edge_in_two_creases_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"'again' and in creases\[0\] 'fold'"):
             self.built(tmp_path, [FLAT, FLAT | {"group": "again"}])
