@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 FABRIC = {"density": 0.2, "membrane": {"c11": 2000.0, "c22": 2000.0, "c12": 600.0, "c33": 700.0}}
 RUBBER = {"young": 1e6, "poisson": 0.5, "thickness": 3e-4, "density": 1000.0, "law": "neo-hookean"}
 
-LOSSES = {"midpoint": 5e-5, "alpha2": 5e-4, "bdf2": 5e-4}
+LOSSES = {"midpoint": 5e-5, "alpha2": 5e-4, "bdf2": 1e-3}
 """Largest error [J] of the balance of energies."""
 
 PUMPED = [[0.0, 1.0], [0.05, 1.05], [0.2, 1.02]]
