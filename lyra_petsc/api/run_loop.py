@@ -195,6 +195,7 @@ class _RunLoop:
                 "unknowns": problem.points.n_unknowns,
             },
             "terms": problem.whole.terms,
+            **problem.whole.summary,
             "partitioner": problem.partitioner,
             "linear_solver": simulation.stepper.preset,
             "petsc_options": PETSc.Options().getAll(),

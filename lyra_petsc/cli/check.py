@@ -194,6 +194,7 @@ def _contact(scene: Scene, gap: float) -> list[tuple[str, str]]:
         f"friction {_friction(contact.friction)}",
     ]
     parts += [] if contact.self else ["with obstacles alone"]
+    parts += ["a start that crosses is untangled"] if contact.untangle else []
     return [("contact", ", ".join(parts)), *_obstacles(scene, contact)]
 
 

@@ -100,7 +100,7 @@ def find_start_crossings(
                 pairs[:, 1],
                 segments,
                 _counted(len(pairs), "pair", "of triangles", "cross"),
-                "move the sheets apart, or give self: false",
+                "move the sheets apart, or give untangle: true, or self: false",
             )
         )
     for wall in symmetry_walls(scene, mesh):
@@ -112,10 +112,10 @@ def find_start_crossings(
                     NOT_ANY,
                     *_alone(passing),
                     f"{count} through the {wall.container.name}",
-                    "move the sheet to one side, or give contact: {self: false}",
+                    "move the sheet to one side, or give contact: {untangle: true} or {self: false}",
                 )
             )
-    remedy = "move the sheet, or the obstacle"
+    remedy = "move the sheet, or the obstacle, or give contact: {untangle: true}"
     for number, obstacle in enumerate(obstacles):
         key, shape = f"obstacles.{obstacle.name}", (scene.obstacles or {})[obstacle.name]
         if shape.mesh is not None:

@@ -363,12 +363,16 @@ class Contact(Block):
         Contact of sheets with themselves and other sheets, too; else with obstacles only.
     friction : float or Friction
         Coulomb's friction coefficient, or a block of two coefficients.
+    untangle : bool
+        Take a start that crosses apart before the first step, by displacements of at most three times the
+        depth of the overlap, or refuse it.
     """
 
     gap: Positive | None = None
     thickness: NonNegative = 0.0
     self: Flag = True
     friction: _AnyFriction = 0.0
+    untangle: Flag = False
 
 
 class Plane(Block):

@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -78,6 +78,8 @@ class WholeProblem:
     sources: list[Source]
     barrier: Barrier | None
     notes: list[str] = field(default_factory=list)
+    summary: dict[str, Any] = field(default_factory=dict)
+    """Entries of summary.json on the set-up."""
 
 
 @dataclass
@@ -234,14 +236,21 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
     if scene.initial is not None:
         data |= start_positions(scene.initial, mesh, held)
         data |= start_velocities(scene.initial, mesh, rest.mass, file=scene.source)
-    positions = None
-    if scene.contact is not None:
+    positions, limits, untangling = None, _barrier(rest), None
+    if scene.contact is not None and limits is not None:
         from lyra_petsc.contact.start_crossings import refuse_crossings  # with kernels
         from lyra_petsc.mesh.obstacles import build_obstacles
 
-        positions = data.get("start", mesh.positions)
+        positions, bodies = data.get("start", mesh.positions), build_obstacles(scene, mesh.obstacles, Motion)
         _refuse_unconnected(scene, mesh, positions)
-        refuse_crossings(scene, mesh, positions, build_obstacles(scene, mesh.obstacles, Motion))
+        if scene.contact.untangle:
+            from lyra_petsc.contact.untangle import untangle  # needed by few scenes
+
+            untangling = untangle(scene, mesh, positions, bodies, limits.gap, held)
+        if untangling is None:
+            refuse_crossings(scene, mesh, positions, bodies)
+        else:
+            positions = data["start"] = untangling.positions
     if mesh.tags is not None:
         data["tag"] = mesh.tags.astype(np.float64)
     whole = WholeProblem(
@@ -252,11 +261,13 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
         largest_coordinate=largest,
         terms=names,
         sources=mesh.sources,
-        barrier=_barrier(rest),
+        barrier=limits,
+        summary={} if untangling is None else {"untangled": untangling.content},
         notes=[
             *scene.notes,
             *mesh.notes,
             *rest.notes,
+            *([] if untangling is None else [untangling.note]),
             *unit_notes(rest),
             *conflicts(scene, mesh, held),
             *clamps_without_edges(scene, mesh, held),
