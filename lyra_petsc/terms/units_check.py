@@ -47,12 +47,15 @@ class Figures:
         C [N/m] and B [N·m], geometric means of warp and weft.
     gravity : float [m/s²]
         Of the scene, or the standard one if it has none.
+    yield_curvature : float [1/m]
+        From which on the material bends plastically.
     """
 
     density: float
     membrane: float
     bending: float
     gravity: float
+    yield_curvature: float = math.inf
 
     @classmethod
     def of(cls, shell: ShellMaterial, gravity: float) -> Figures:
@@ -61,7 +64,7 @@ class Figures:
         if shell.model == "midedge" and shell.plate[0] > 0.0:
             warp, _, weft, _ = shell.plate
         membrane, bending = math.sqrt(shell.c11) * math.sqrt(shell.c22), math.sqrt(warp) * math.sqrt(weft)
-        return cls(shell.density, membrane, bending, gravity)
+        return cls(shell.density, membrane, bending, gravity, shell.yield_curvature)
 
     @property
     def thickness(self) -> float:
@@ -78,7 +81,10 @@ class Figures:
         text = f"{self.density:.4g} kg/m²"
         if h := self.thickness:
             text += f", {self.density / h:.3g} kg/m³ if {1e3 * h:.3g} mm thick"
-        return f"{text}, bending length {1e3 * self.bending_length:.3g} mm"
+        text += f", bending length {1e3 * self.bending_length:.3g} mm"
+        if math.isfinite(self.yield_curvature):
+            text += f", keeps folds of less than {1e3 / self.yield_curvature:.3g} mm radius"
+        return text
 
     def doubt(self, block: Material, size: float, *, weighs: bool) -> str:
         """What cannot be right, with the likely mistake; empty if nothing is wrong.

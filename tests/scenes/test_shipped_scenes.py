@@ -23,6 +23,7 @@ SHIPPED = (
     "ball",
     "balloon",
     "buckle",
+    "crease",
     "cushion",
     "drape",
     "flag",
@@ -136,6 +137,19 @@ def test_the_tip_of_the_flag_agrees_with_finer_steps() -> None:
     with simulated("flag", "mesh.size=0.1", "time.end=0.25", "time.step=0.003125") as simulation:
         tip = mean_of(simulation, "tip")
     np.testing.assert_allclose(tip, [1.4778, 0.2017, 0.7594], atol=2e-3)
+
+
+def test_the_paper_keeps_its_crease() -> None:
+    strip = "mesh.grid.ny=1", "mesh.grid.height=0.002", "mesh.transform.translate=[-0.1, -0.001, 0]"
+    with simulated("crease", *strip, "output.every=0.5") as simulation:
+        x = simulation.problem.equations.x[: simulation.problem.points.n_vertices]
+        # on one rank, vertices may be in another order than in the mesh
+        start = simulation.problem.surface.x
+        kinetic = simulation.budget.kinetic
+    assert kinetic < 1e-9  # at rest
+    near, far = (x[np.abs(start[:, 0] - at) < 1e-6].mean(axis=0) for at in (0.02, 0.04))
+    angle = np.degrees(np.arctan2(far[2] - near[2], far[0] - near[0]))
+    assert angle == pytest.approx(136.4, abs=2.0)  # of 150
 
 
 def test_the_draped_square_hangs_with_its_whole_weight() -> None:
