@@ -97,3 +97,11 @@ def test_figures_of_a_homogeneous_sheet() -> None:
     (found,) = figures(rest_of({"density": 0.15, "membrane": WOVEN["membrane"]}, gravity=[0, 0, 0]))
     assert str(found) == "0.15 kg/m², bending length 0 mm"
     assert np.isfinite(found.bending_length)
+
+
+def test_the_largest_gravity_of_a_curve_counts() -> None:
+    ramp = [[0, [0, 0, 0]], [1, [0, 0, -9.81]], [2, [0, 0, 0]]]
+    (plain,), (varying,) = (figures(rest_of(WOVEN, gravity=g)) for g in ([0, 0, -9.81], ramp))
+    assert varying == plain
+    (note,) = unit_notes(rest_of(WOVEN | {"membrane": SOFT}, gravity=ramp))
+    assert "membrane in N/mm" in note
