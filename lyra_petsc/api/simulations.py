@@ -241,6 +241,12 @@ class Simulation:
             self._refuse_crossings(x)
         with np.errstate(over="ignore", invalid="ignore"):
             set_state(run, x, v)
+        self._note(name)
+
+    def _note(self, name: str) -> None:
+        """Note, also for states that are saved, that the program has changed something."""
+        text = f"the program has set {name}: the scene alone does not repeat this run"
+        self._running.run_notes.once(f"set {name}", text)
 
     def _refuse_crossings(self, positions: Array) -> None:
         """Refuse positions (n, 3) at which sheets cross each other or obstacles."""
@@ -269,6 +275,7 @@ class Simulation:
         if self._forces is None:
             self._forces = add_forces(self._running)
         self._forces.set(self._running, rows)
+        self._note("forces")
 
     def _rows(self, name: str, values: Any) -> Array:
         """Finite numbers (n, 3) for this rank's vertices; refuses others on all ranks."""
@@ -317,6 +324,7 @@ class Simulation:
         if motion.go_to(target, run.time):
             run.expect_jump(run.time)
         run.follow_driven(time)
+        self._note(name)
 
     def set(self, name: str, value: Any, *, at: float | None = None) -> None:
         """Change a driven value of the scene now, or in a straight line until a time.
@@ -339,6 +347,7 @@ class Simulation:
             run.expect_jump(run.time)
         else:
             run.follow_driven(time)
+        self._note(name)
 
     def _driven_as(self, name: str, kind: type[Any], call: str) -> Any:
         if name not in self._driven:

@@ -150,7 +150,11 @@ def test_a_restored_state_goes_on_as_the_saved_one(comm: Any, integrator: str) -
         for one, other in zip(first, second, strict=True):
             np.testing.assert_allclose(one.positions, other.positions, atol=1e-11)
             assert one.energies == pytest.approx(other.energies, rel=1e-6, abs=1e-12)
+        for name in ("handles[0]", "forces"):
+            (note,) = (note for note in simulation.notes if f"program has set {name}" in note)
+            assert "does not repeat this run" in note
         simulation.reset()
+        assert not any("program has set" in note for note in simulation.notes)
         np.testing.assert_array_equal(simulation.positions, start)
         assert not simulation.forces.any()
         assert simulation.step_number == 0
