@@ -135,21 +135,6 @@ class RestShape:
                     file=scene.source,
                     key=key,
                 )
-            slides = np.array(
-                [
-                    max(shell.friction_moment) > 0.0
-                    or (shell.bends_with("midedge") and np.isfinite(shell.yield_curvature))
-                    for shell in self.shells
-                ]
-            )[self.shell_of]
-            if slides[self.hinges.triangles[chosen]].any():
-                raise InputError(
-                    f"'{block.group}' lies in a material with friction_moment or yield_curvature, which "
-                    "bending_model: midedge has no law for beside a crease; leave these out, or for "
-                    "yield_curvature take bending_model: hinge",
-                    file=scene.source,
-                    key=key,
-                )
             crease[chosen] = number
         return crease
 

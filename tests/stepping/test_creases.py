@@ -68,6 +68,22 @@ def test_creases_take_their_rest_angles_of_both_signs(comm: MPI.Comm, model: str
 
 
 @pytest.mark.parametrize("model", MODELS)
+def test_the_panels_plasticity_and_friction_leave_creases_free(
+    comm: MPI.Comm, model: str, shared_tmp: Path
+) -> None:
+    creases = [{"group": "valley", "angle": 120.0, "stiffness": 1e-3}]
+    content = folded(comm, shared_tmp, model, creases, {"valley": 1, "mountain": 3}, nx=5)
+    content["material"] |= {"yield_curvature": 0.1, "hardening": 0.1}
+    if model == "midedge":
+        content["material"]["friction_moment"] = 1e-3
+    with finished(comm, content) as simulation:
+        found = angles(shape(simulation), 5)
+        heat = simulation.budget.dissipation
+    np.testing.assert_allclose(found, [0.0, 120.0, 120.0, 120.0, 120.0], atol=1e-4)
+    assert abs(heat) < 1e-9
+
+
+@pytest.mark.parametrize("model", MODELS)
 def test_a_crease_opens_under_a_moment_by_its_stiffness(comm: MPI.Comm, model: str, shared_tmp: Path) -> None:
     # a force F on the end of a rigid arm L: k l θ = F L cos θ
     content = folded(comm, shared_tmp, model, [FLAT | {"stiffness": 0.1}], {"fold": 1}, nx=2)

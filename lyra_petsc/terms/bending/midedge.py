@@ -523,30 +523,42 @@ def _release_creases(
     """Let triangles ``chosen`` (F,) with edges ``number`` (F, 3) end at creases as at free edges, in place.
 
     Each of the two triangles at a crease would have a director of its own there, which its forms (F, 3, 3)
-    no longer contain: they are those of the remaining edges, least over that director. The one director
-    (n_edges, 3) that there is turns with the first triangle, whose form keeps its square alone, and is
-    without energy in equilibrium.
+    no longer contain (`condense_creases`). The one director (n_edges, 3) that there is turns with the first
+    triangle, whose form keeps its square alone, and is without energy in equilibrium.
     """
-    quad, faces = rest.hinges.vertices, rest.hinges.triangles
-    keys = rest.edges[:, 0] * rest.mesh.n_vertices + rest.edges[:, 1]
-    low, high = np.sort(quad[rest.crease_of >= 0, :2], axis=1).T
-    creased = np.isin(number, np.searchsorted(keys, low * rest.mesh.n_vertices + high))
-    first = np.zeros(len(rest.edges), dtype=np.int64)
-    first[np.searchsorted(keys, low * rest.mesh.n_vertices + high)] = faces[rest.crease_of >= 0, 0]
-    for triangle in np.flatnonzero(creased.any(axis=1)):
-        gone = creased[triangle]
-        whole, kept = form[triangle].copy(), np.flatnonzero(~gone)
-        gone = np.flatnonzero(gone)
-        form[triangle] = 0.0
-        to_gone = np.linalg.solve(whole[np.ix_(gone, gone)], whole[np.ix_(gone, kept)])
-        form[triangle][np.ix_(kept, kept)] = whole[np.ix_(kept, kept)] - whole[np.ix_(kept, gone)] @ to_gone
-        for side in gone[first[number[triangle, gone]] == chosen[triangle]]:
-            form[triangle, side, side] = whole[side, side]
+    first = _first_triangles_at_creases(rest)
+    sides = first[number] == chosen[:, None]
+    face, side = np.nonzero(sides)
+    square = form[face, side, side].copy()
+    condense_creases(form, rest, number)
+    form[face, side, side] = square
     x, triangles = rest.mesh.positions, rest.mesh.triangles[chosen]
-    sides = creased & (first[number] == chosen[:, None])
     own = np.where(sides, number, len(rest.edges))
     alone = mean_directors(x, triangles, own, len(rest.edges) + 1, rotation)
     director[number[sides]] = alone[number[sides]]
+
+
+def _first_triangles_at_creases(rest: RestShape) -> Ints:
+    """The first triangle at each edge of the mesh, (n_edges,); −1 for edges that are no creases."""
+    chosen = rest.crease_of >= 0
+    keys = rest.edges[:, 0] * rest.mesh.n_vertices + rest.edges[:, 1]
+    low, high = np.sort(rest.hinges.vertices[chosen, :2], axis=1).T
+    first = np.full(len(rest.edges), -1, dtype=np.int64)
+    first[np.searchsorted(keys, low * rest.mesh.n_vertices + high)] = rest.hinges.triangles[chosen, 0]
+    return first
+
+
+def condense_creases(form: Array, rest: RestShape, number: Ints) -> None:
+    """Replace the forms (F, 3, 3) of triangles with edges ``number`` (F, 3) by their least values over the
+    directors at creases, in place.
+    """
+    creased = _first_triangles_at_creases(rest)[number] >= 0
+    for triangle in np.flatnonzero(creased.any(axis=1)):
+        gone, kept = np.flatnonzero(creased[triangle]), np.flatnonzero(~creased[triangle])
+        whole = form[triangle].copy()
+        form[triangle] = 0.0
+        to_gone = np.linalg.solve(whole[np.ix_(gone, gone)], whole[np.ix_(gone, kept)])
+        form[triangle][np.ix_(kept, kept)] = whole[np.ix_(kept, kept)] - whole[np.ix_(kept, gone)] @ to_gone
 
 
 def _align_with_symmetry(director: Array, rest: RestShape, triangles: Ints, number: Ints, x: Array) -> None:

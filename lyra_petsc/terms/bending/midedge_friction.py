@@ -187,12 +187,16 @@ def sliding_elements(rest: RestShape, stiffness: Array, limit: Array, *also: str
     shell = rest.shell_of[data["triangle"].astype(np.int64)]
     curvature, area = midedge.curvatures_of_tangents(data["material"]), midedge.areas(data["material"])
     form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness[shell], curvature)
+    rows = stiffness[shell, 0, 0] > 0.0
+    assert triangles.edges is not None
+    if rest.scene.creases:
+        part = form[rows]
+        midedge.condense_creases(part, rest, triangles.edges[rows])
+        form[rows] = part
     data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
     data["r_y"] = np.sqrt(area * limit[shell])
     for name in {"direction", "director", "material", "length", "rest_rotation", "damping"}.difference(also):
         del data[name]
-    assert triangles.edges is not None
-    rows = stiffness[shell, 0, 0] > 0.0
     chosen = {name: values[rows] for name, values in data.items()}
     return Elements(triangles.stencil[rows], chosen, edges=triangles.edges[rows])
 
@@ -210,7 +214,7 @@ def coarse_elements(rest: RestShape) -> Elements:
     """Hinges between the same triangles, which bend like them while nothing slides."""
     quad, faces = rest.hinges.vertices, rest.hinges.triangles
     moments = np.array([shell.friction_moment for shell in rest.shells])
-    limit, bends = np.full(len(quad), np.inf), np.ones(len(quad), dtype=bool)
+    limit, bends = np.full(len(quad), np.inf), rest.crease_of < 0
     for side in range(2):
         edge, stiffness = edge_in_material(rest, faces[:, side], quad[:, 0], quad[:, 1], "midedge")
         across = edge[:, ::-1] ** 2 / np.sum(edge * edge, axis=1, keepdims=True)
