@@ -21,7 +21,7 @@ from lyra_petsc.mesh.readers import first_few
 from lyra_petsc.mesh.select import DIMENSION_NAMES
 from lyra_petsc.mesh.topology import connected_components, connected_pieces, edge_table
 from lyra_petsc.mesh.weld import coincident_with, weld
-from lyra_petsc.scene.schema import Grid, MeshSource, Rotation, Scene, Transform
+from lyra_petsc.scene.schema import Grid, MeshSource, Obstacle, Rotation, Scene, Transform
 
 # A triangle is degenerate if twice its area is below this fraction of its longest side squared. Slivers of
 # aspect ratio 1e9 pass; three points on a line do not, despite their round-off.
@@ -254,7 +254,21 @@ def build_scene_mesh(scene: Scene, report: Callable[[str], None] | None = None) 
             source = MeshSource(file=obstacle.mesh.file, transform=obstacle.mesh.transform)
             mesh.obstacles[name], notes = _read_surface(source, scene.trusts_meshes, report)
             mesh.notes += [f"obstacle {name}: {note}" for note in notes]
+            if obstacle.mesh.frames is not None:
+                mesh.obstacles[name] = _at_start(mesh.obstacles[name], obstacle)
     return mesh
+
+
+def _at_start(surface: TriangleSurface, obstacle: Obstacle) -> TriangleSurface:
+    """The surface of an obstacle as its frames have it at t = 0; all frames are checked."""
+    from lyra_petsc.mesh.frame_files import check_frames  # with frames only
+    from lyra_petsc.mesh.obstacles import surface_motion
+
+    assert obstacle.mesh is not None
+    motion = surface_motion(obstacle)
+    of = f"{obstacle.mesh.file.name}, of which it holds places, has"
+    check_frames(motion.frames, (len(surface.points),), of)
+    return surface._replace(points=motion.positions(0.0))
 
 
 def _read_surface(
@@ -265,14 +279,14 @@ def _read_surface(
         sheet = _read(source, trust_scripts, report)
         sheet.uv = None
         check_topology(sheet, file=source.file)
-        _, points = _transformed(sheet.points, source.transform)
+        _, points = transformed(sheet.points, source.transform)
         check_shape(points[sheet.triangles], "start", file=source.file)
     except MemoryError:
         raise InputError("the mesh does not fit into memory", file=source.file) from None
     return TriangleSurface(points, sheet.triangles), sheet.notes
 
 
-def _transformed(points: Array, transform: Transform) -> tuple[Array, ...]:
+def transformed(points: Array, transform: Transform) -> tuple[Array, ...]:
     """Points (n, 3) [m] after the scaling, and after the whole transform."""
     scaled = points * np.asarray(transform.scale)
     turned = scaled if transform.rotate is None else scaled @ _rotation_matrix(transform.rotate).T
@@ -370,7 +384,7 @@ def _check_and_transform(sheet: Sheet, source: MeshSource, key: str, file: objec
     if source.weld is not None:
         _weld(sheet, source, source.weld, where)
     orient(sheet, **where)
-    rest, positions = _transformed(sheet.points, source.transform)
+    rest, positions = transformed(sheet.points, source.transform)
     if source.uv is not None and sheet.uv is not None:
         sheet.uv = None if source.uv == "ignore" else sheet.uv * source.uv
     uv = sheet.uv
@@ -393,7 +407,7 @@ def _check_and_transform(sheet: Sheet, source: MeshSource, key: str, file: objec
 
 def _weld(sheet: Sheet, source: MeshSource, distance: float, where: dict[str, Any]) -> None:
     """Join coincident vertices of the scaled sheet, with a note."""
-    dropped = weld(sheet, _transformed(sheet.points, source.transform)[0], distance)
+    dropped = weld(sheet, transformed(sheet.points, source.transform)[0], distance)
     if not dropped:
         sheet.notes.append(f"no vertices coincide within weld = {distance:g} m")
         return

@@ -17,6 +17,8 @@ from lyra_petsc.scene.schema import Cuboid, Obstacle, Scene, coefficients
 if TYPE_CHECKING:
     from mpi4py import MPI
 
+    from lyra_petsc.mesh.frame_motion import FrameMotion
+
 
 # corner i + 2 j + 4 k of a box is at its upper end in x, y, z where i, j, k are 1
 _CORNERS = np.array([[i, j, k] for k in (0, 1) for j in (0, 1) for i in (0, 1)], dtype=np.float64)
@@ -207,12 +209,36 @@ def _build_obstacle(
         return Solid(name, corners, _BOX_EDGES.copy(), BOX_TRIANGLES.copy(), 0.0, friction, rigid_motion)
     if obstacle.mesh is not None:
         points, triangles = surfaces[name]
-        return Solid(name, points, unique_edges(triangles), triangles, 0.0, friction, rigid_motion)
+        edges, deformation = unique_edges(triangles), None
+        if obstacle.mesh.frames is not None:
+            deformation = surface_motion(obstacle).positions
+        return Solid(name, points, edges, triangles, 0.0, friction, rigid_motion, deformation)
     axis, radius = axis_and_radius(obstacle)
     if obstacle.inside:
         return Container(name, "ball", axis, np.empty((0, 3)), radius, friction, rigid_motion)
     edges = np.array([[0, 1]] * (len(axis) - 1), dtype=np.int64).reshape(-1, 2)
     return Solid(name, axis, edges, np.empty((0, 3), dtype=np.int64), radius, friction, rigid_motion)
+
+
+def surface_motion(obstacle: Obstacle) -> FrameMotion:
+    """The motion through frames of an obstacle that is a mesh.
+
+    Raises
+    ------
+    InputError
+        If its files cannot be read as frames.
+    """
+    from lyra_petsc.mesh.build import transformed  # with frames only
+    from lyra_petsc.mesh.frame_files import open_frames
+    from lyra_petsc.mesh.frame_motion import FrameMotion
+
+    mesh = obstacle.mesh
+    assert mesh is not None
+    assert mesh.frames is not None
+    frames, transform = open_frames(mesh.frames, mesh.fps), mesh.transform
+    return FrameMotion(
+        frames, obstacle.interpolation, repeat=mesh.repeat, chosen=lambda x: transformed(x, transform)[1]
+    )
 
 
 def axis_and_radius(obstacle: Obstacle) -> tuple[Array, float]:

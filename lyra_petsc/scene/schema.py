@@ -31,6 +31,7 @@ from lyra_petsc.scene.block import BY_KIND, Block
 from lyra_petsc.scene.camera_block import Render
 from lyra_petsc.scene.crease_block import Crease
 from lyra_petsc.scene.fit_block import Fit
+from lyra_petsc.scene.frames_key import FramesPath
 from lyra_petsc.scene.gas_block import Gas, Liquid
 from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.petsc_block import PetscValue, petsc_options
@@ -232,10 +233,18 @@ class Handle(Selector):
         ``axes``; needs ``midedge``.
     motion : str or None
         Name in ``motions``; without it the vertices keep their positions.
+    frames : Path or list of Path or None
+        Positions of the vertices in files, as the ``frames`` of an obstacle's mesh: those of the group in the
+        order of the mesh, or of all vertices. The vertices move by the frames' displacements from where they
+        are when the handle begins to act.
+    fps : float [1/s] or None
+        Frames per second, for files without times.
+    repeat : bool
+        Whether frames begin again after the last one, as those of an obstacle's mesh.
     interpolation : str
-        Interpolation of the motion between keyframes. ``monotone``: smooth, and never beyond two neighbouring
-        keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes before a hold;
-        ``linear``.
+        Interpolation of the motion between keyframes or frames. ``monotone``: smooth, and never beyond two
+        neighbouring keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes
+        before a hold; ``linear``.
     start, until : float [s]
         The handle acts for from ≤ t ≤ until; by default always.
     fade : float [s]
@@ -248,6 +257,9 @@ class Handle(Selector):
     clamp: Flag = False
     symmetry: Direction | None = None
     motion: Name | None = None
+    frames: FramesPath | None = None
+    fps: Positive | None = None
+    repeat: Flag = False
     interpolation: Interpolation = "monotone"
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
@@ -278,12 +290,20 @@ class Handle(Selector):
             "keeps no slope of an edge that springs hold along some axes; hold all axes, or leave clamp out",
             "clamp",
         )
-        others = self.clamp or self.start > 0.0 or self.fade > 0.0 or self.present("motion", "stiffness")
+        _check_frames(self)
+        require(not (self.frames and self.motion), "is a second motion; leave out motion or frames", "frames")
+        require(
+            not (self.frames and self.clamp),
+            "keeps no slope of edges that frames move; hold two rows of vertices, or leave clamp out",
+            "clamp",
+        )
+        others = bool(self.present("motion", "frames", "stiffness"))
+        others = others or self.clamp or self.start > 0.0 or self.fade > 0.0
         self.require_with(
             "symmetry",
             self.axes == AXES and not others,
-            "is a plane that stands still and mirrors the sheet; leave out axes, clamp, motion, stiffness, "
-            "from and fade",
+            "is a plane that stands still and mirrors the sheet; leave out axes, clamp, motion, frames, "
+            "stiffness, from and fade",
         )
         _check_window(self.start, self.until)
 
@@ -452,11 +472,49 @@ class ObstacleMesh(Block):
         A mesh file (.geo, .msh, .obj, .stl, .ply, .off, .vtk, .inp, .bdf, .unv); the path is relative to the
         scene file.
     transform : Transform
-        Transform from the mesh to the position at t = 0.
+        Transform from the mesh, and its frames, to positions.
+    frames : Path or list of Path or None
+        Files with the positions of the vertices at given times, through which the surface moves: an .npz file
+        with ``position`` (T, V, 3) and ``time`` (T,) as ``export --to npz`` writes it, a sequence of .obj
+        files (``body_*.obj``, or their list), or a USD file with one mesh whose points change (.usd, .usda,
+        .usdc). V is the number of vertices of ``file``. Before the first frame and after the last one the
+        surface stands still.
+    fps : float [1/s] or None
+        Frames per second, for files without times; the first frame is at t = 0.
+    repeat : bool
+        Whether frames begin again after the last one: after the time between the last two, or at once if the
+        last frame is the first one again.
     """
 
     file: MeshPath
     transform: Transform = Field(default_factory=Transform)
+    frames: FramesPath | None = None
+    fps: Positive | None = None
+    repeat: Flag = False
+
+    @classmethod
+    def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """Take the frames of a list of files."""
+        files = data.get("file")
+        if isinstance(files, (list, tuple)) and files and data.get("frames") is None:
+            return data | {"file": files[0], "frames": files}
+        return data
+
+    def check(self) -> None:
+        """Refuse keys for frames without frames."""
+        _check_frames(self)
+
+
+def _check_frames(block: Handle | ObstacleMesh) -> None:
+    for key in ("fps", "repeat"):
+        if block.get(key):
+            require(block.frames is not None, "is for frames, which are absent", key)
+    with_times = isinstance(block.frames, Path) and block.frames.suffix.lower() != ".obj"
+    require(
+        block.frames is None or with_times or block.fps is not None,
+        "have no times; give fps, the frames per second",
+        "frames",
+    )
 
 
 SHAPES = ("plane", "sphere", "capsule", "box", "mesh")
@@ -464,7 +522,7 @@ SHAPES = ("plane", "sphere", "capsule", "box", "mesh")
 
 
 class Obstacle(Block):
-    """A rigid obstacle of one shape, which sheets cannot penetrate.
+    """An obstacle of one shape, which sheets cannot penetrate: rigid, or a mesh that moves through frames.
 
     Attributes
     ----------
@@ -483,9 +541,9 @@ class Obstacle(Block):
     motion : str or list of Keyframe or None
         Name in ``motions``, or keyframes, without ``scale``; by default the obstacle is at rest.
     interpolation : str
-        Interpolation of the motion between keyframes. ``monotone``: smooth, and never beyond two neighbouring
-        keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes before a hold;
-        ``linear``.
+        Interpolation of the motion between keyframes or frames. ``monotone``: smooth, and never beyond two
+        neighbouring keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes
+        before a hold; ``linear``.
     friction : float or Friction or None
         Friction coefficient, instead of that of ``contact``.
     """
@@ -513,6 +571,11 @@ class Obstacle(Block):
             not self.inside or self.present("sphere", "capsule", "box"),
             "is for sphere, capsule and box; a plane is free on the side of its normal, and a mesh on both",
             "inside",
+        )
+        require(
+            self.motion is None or self.mesh is None or self.mesh.frames is None,
+            "is a second motion beside mesh.frames; leave one of them out",
+            "motion",
         )
 
     @property
@@ -906,7 +969,7 @@ class Scene(Block):
 
     @property
     def mesh_files(self) -> dict[tuple[str | int, ...], Path]:
-        """Files of sheets and obstacles, by their keys."""
+        """Files of sheets, obstacles and frames, by their keys."""
         files: dict[tuple[str | int, ...], Path] = {}
         for i, source in enumerate(self.mesh):
             if source.file is not None:
@@ -914,7 +977,16 @@ class Scene(Block):
         for name, obstacle in (self.obstacles or {}).items():
             if obstacle.mesh is not None:
                 files["obstacles", name, "mesh", "file"] = obstacle.mesh.file
+                files |= _frame_files(obstacle.mesh.frames, "obstacles", name, "mesh", "frames")
+        for i, handle in enumerate(self.handles):
+            files |= _frame_files(handle.frames, "handles", i, "frames")
         return files
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether anything moves through frames."""
+        meshes = (obstacle.mesh for obstacle in (self.obstacles or {}).values())
+        return any(block is not None and block.frames is not None for block in (*meshes, *self.handles))
 
     @property
     def has_scripts(self) -> bool:
@@ -1008,6 +1080,13 @@ class Scene(Block):
         if isinstance(motion, str):
             return self.motions[motion]
         return motion if isinstance(motion, list) else []
+
+
+def _frame_files(frames: Any, *at: str | int) -> dict[tuple[str | int, ...], Path]:
+    """Files of frames by their keys, without those of a pattern."""
+    if isinstance(frames, tuple):
+        return {(*at, i): file for i, file in enumerate(frames)}
+    return {} if frames is None or "*" in frames.name else {at: frames}
 
 
 def _check_keyframes(keyframes: list[Keyframe], *at: str | int) -> None:

@@ -188,6 +188,9 @@ def event_times(scene: Scene) -> list[float]:
         for t in motion_of(scene, number).velocity_jumps
         if window.start < t < window.until + window.fade
     ]
+    for obstacle in (scene.obstacles or {}).values():
+        if obstacle.mesh is not None and obstacle.mesh.frames is not None:
+            jumps += surface_motion(obstacle).kinks(scene.time.end, scene.time.step)
     windows += [Window(load.start, load.until) for load in scene.loads]
     return [*(t for window in windows for t in window.events()), *jumps]
 

@@ -41,6 +41,7 @@ def nothing_acts(
     """
     motions = [*scene.motions.values(), *map(scene.keyframes, (scene.obstacles or {}).values())]
     moves = any(frame != Keyframe(time=frame.time) for frames in motions for frame in frames)
+    moves = moves or scene.has_frames
     if moves or (scene.wind is not None and acts(scene.wind.velocity)):
         return []
     comm, active, stops = (

@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.interpolation import hermite, without_overshoot
 from lyra_petsc.scene.schema import MAX_SPEED, Handle, Keyframe, Rotation, Scene
 
 SAME_AXIS = 1e-12
@@ -91,25 +91,6 @@ def _turn_angles(keyframes: Sequence[Keyframe], key: str, file: object) -> list[
     return turns
 
 
-def _hermite(s: float, h: float, p: Any, q: Any, m: Any, n: Any) -> tuple[Any, Any]:
-    """Value and rate at the part s of an interval of length h, of the cubic polynomial with values p, q and
-    rates m, n at its ends.
-    """
-    value = (1 + 2 * s) * (1 - s) ** 2 * p + s * s * (3 - 2 * s) * q
-    value = value + h * s * (1 - s) * ((1 - s) * m - s * n)
-    rate = 6 * s * (1 - s) / h * (q - p) + (1 - s) * (1 - 3 * s) * m + s * (3 * s - 2) * n
-    return value, rate
-
-
-def _without_overshoot(rate: Any, before: Any, after: Any) -> Any:
-    """The rate at a keyframe between intervals with mean rates ``before`` and ``after``, limited such that
-    values on both intervals stay between those of the keyframes (F. N. Fritsch, R. E. Carlson, SIAM J. Numer.
-    Anal. 17 (1980) 238-246).
-    """
-    largest = 3.0 * np.minimum(np.abs(before), np.abs(after))
-    return np.where(np.sign(before) == np.sign(after), np.clip(rate, -largest, largest), 0.0)
-
-
 class Motion:
     """T(t) = translate ∘ rotate ∘ scale through keyframes.
 
@@ -171,7 +152,7 @@ class Motion:
             self._tangents[1:-1] = (self._values[2:] - self._values[:-2]) / spans
         if self._monotone and n > 2:
             slopes = np.diff(self._values, axis=0) / np.diff(self._times)[:, None]
-            self._tangents[1:-1] = _without_overshoot(self._tangents[1:-1], slopes[:-1], slopes[1:])
+            self._tangents[1:-1] = without_overshoot(self._tangents[1:-1], slopes[:-1], slopes[1:])
         for i, k in enumerate(keyframes):
             if k.velocity is not None:
                 self._tangents[i, :3] = k.velocity
@@ -200,7 +181,7 @@ class Motion:
                     turned = np.array([angles[i - 1] * math.copysign(1.0, along), angles[i]])
                     rates[i] = float(turned.sum() / spans.sum())
                     if self._monotone:
-                        rates[i] = float(_without_overshoot(rates[i], *(turned / spans)))
+                        rates[i] = float(without_overshoot(rates[i], *(turned / spans)))
         signs = [1.0 if i == 0 or axes[i - 1] @ axes[i] > 0.0 else -1.0 for i in range(len(turns))]
         self._rotations = []
         for i, angle in enumerate(angles):
@@ -232,7 +213,7 @@ class Motion:
         p, q = values[i], values[i + 1]
         if self._linear:
             return p + s * (q - p), (q - p) / h
-        return _hermite(s, h, p, q, self._tangents[i], self._tangents[i + 1])
+        return hermite(s, h, p, q, self._tangents[i], self._tangents[i + 1])
 
     def _place(self, time: float) -> tuple[int, float, float]:
         """Number and length [s] of the interval between keyframes at ``time``, and the part of it before."""
@@ -261,7 +242,7 @@ class Motion:
             return _rotation(quaternion), 2.0 * turn / (quaternion @ quaternion)
         i, h, s = self._place(time)
         axis, angle, first, last = self._rotations[i]
-        part, speed = (s * angle, angle / h) if self._linear else _hermite(s, h, 0.0, angle, first, last)
+        part, speed = (s * angle, angle / h) if self._linear else hermite(s, h, 0.0, angle, first, last)
         turn = np.concatenate([[math.cos(0.5 * part)], math.sin(0.5 * part) * axis])
         return _rotation(turn) @ _rotation(self._values[i, 6:]), speed * axis
 
