@@ -20,7 +20,7 @@ from lyra_petsc.mesh.topology import connected_pieces
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.load import default_scene
-from lyra_petsc.scene.schema import Contact, Friction, Scene, coefficients
+from lyra_petsc.scene.schema import Contact, Friction, Obstacle, Scene, coefficients
 from lyra_petsc.scene.time_curve import curves
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.problem import Problem
@@ -205,8 +205,22 @@ def _obstacles(scene: Scene, contact: Contact) -> list[tuple[str, str]]:
         parts = [f"inside of a {obstacle.shape}" if obstacle.inside else obstacle.shape]
         if obstacle.motion is not None:
             parts.append(f"moves by {obstacle.motion!r}" if isinstance(obstacle.motion, str) else "moves")
+        if obstacle.mesh is not None and obstacle.mesh.frames is not None:
+            parts += _frames(obstacle, scene)
         rows.append((one_line(f"obstacle {name}"), ", ".join([*parts, f"friction {_friction(friction)}"])))
     return rows
+
+
+def _frames(obstacle: Obstacle, scene: Scene) -> list[str]:
+    """What frames do with an obstacle."""
+    from lyra_petsc.mesh.obstacles import surface_motion  # with frames only
+
+    motion, step = surface_motion(obstacle), scene.time.step
+    times = motion.frames.times
+    parts = [f"{len(times)} frames from {times[0]:g} to {times[-1]:g} s, {obstacle.interpolation}"]
+    if isinstance(step, float) and step > motion.interval:
+        parts.append(f"steps of {step:g} s pass over {step / motion.interval:.3g} frames each")
+    return parts
 
 
 def _friction(friction: float | Friction) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.frame_files import FrameFile
 from lyra_petsc.mesh.interpolation import hermite, without_overshoot
@@ -141,8 +141,9 @@ class FrameMotion:
         return 0.5 * (self._at(time - step)[1] + self._at(time + step)[1])
 
     def kinks(self, end: float, step: float) -> list[float]:
-        """Times [s] before ``end`` at which the velocity jumps and steps of ``step`` [s] must end: none if frames
-        follow each other faster, which steps pass over.
+        """Times [s] before ``end`` at which the velocity jumps and steps of ``step`` [s] must end.
+
+        There are none if frames follow each other faster: steps pass over these.
         """
         if not self._linear or not step <= self.interval < np.inf:
             return []

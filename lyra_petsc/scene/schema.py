@@ -233,18 +233,10 @@ class Handle(Selector):
         ``axes``; needs ``midedge``.
     motion : str or None
         Name in ``motions``; without it the vertices keep their positions.
-    frames : Path or list of Path or None
-        Positions of the vertices in files, as the ``frames`` of an obstacle's mesh: those of the group in the
-        order of the mesh, or of all vertices. The vertices move by the frames' displacements from where they
-        are when the handle begins to act.
-    fps : float [1/s] or None
-        Frames per second, for files without times.
-    repeat : bool
-        Whether frames begin again after the last one, as those of an obstacle's mesh.
     interpolation : str
-        Interpolation of the motion between keyframes or frames. ``monotone``: smooth, and never beyond two
-        neighbouring keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes
-        before a hold; ``linear``.
+        Interpolation of the motion between keyframes. ``monotone``: smooth, and never beyond two neighbouring
+        keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes before a hold;
+        ``linear``.
     start, until : float [s]
         The handle acts for from ≤ t ≤ until; by default always.
     fade : float [s]
@@ -257,9 +249,6 @@ class Handle(Selector):
     clamp: Flag = False
     symmetry: Direction | None = None
     motion: Name | None = None
-    frames: FramesPath | None = None
-    fps: Positive | None = None
-    repeat: Flag = False
     interpolation: Interpolation = "monotone"
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
@@ -290,20 +279,12 @@ class Handle(Selector):
             "keeps no slope of an edge that springs hold along some axes; hold all axes, or leave clamp out",
             "clamp",
         )
-        _check_frames(self)
-        require(not (self.frames and self.motion), "is a second motion; leave out motion or frames", "frames")
-        require(
-            not (self.frames and self.clamp),
-            "keeps no slope of edges that frames move; hold two rows of vertices, or leave clamp out",
-            "clamp",
-        )
-        others = bool(self.present("motion", "frames", "stiffness"))
-        others = others or self.clamp or self.start > 0.0 or self.fade > 0.0
+        others = self.clamp or self.start > 0.0 or self.fade > 0.0 or self.present("motion", "stiffness")
         self.require_with(
             "symmetry",
             self.axes == AXES and not others,
-            "is a plane that stands still and mirrors the sheet; leave out axes, clamp, motion, frames, "
-            "stiffness, from and fade",
+            "is a plane that stands still and mirrors the sheet; leave out axes, clamp, motion, stiffness, "
+            "from and fade",
         )
         _check_window(self.start, self.until)
 
@@ -505,7 +486,7 @@ class ObstacleMesh(Block):
         _check_frames(self)
 
 
-def _check_frames(block: Handle | ObstacleMesh) -> None:
+def _check_frames(block: ObstacleMesh) -> None:
     for key in ("fps", "repeat"):
         if block.get(key):
             require(block.frames is not None, "is for frames, which are absent", key)
@@ -978,15 +959,13 @@ class Scene(Block):
             if obstacle.mesh is not None:
                 files["obstacles", name, "mesh", "file"] = obstacle.mesh.file
                 files |= _frame_files(obstacle.mesh.frames, "obstacles", name, "mesh", "frames")
-        for i, handle in enumerate(self.handles):
-            files |= _frame_files(handle.frames, "handles", i, "frames")
         return files
 
     @property
     def has_frames(self) -> bool:
         """Whether anything moves through frames."""
         meshes = (obstacle.mesh for obstacle in (self.obstacles or {}).values())
-        return any(block is not None and block.frames is not None for block in (*meshes, *self.handles))
+        return any(mesh is not None and mesh.frames is not None for mesh in meshes)
 
     @property
     def has_scripts(self) -> bool:

@@ -190,7 +190,10 @@ def event_times(scene: Scene) -> list[float]:
     ]
     for obstacle in (scene.obstacles or {}).values():
         if obstacle.mesh is not None and obstacle.mesh.frames is not None:
-            jumps += surface_motion(obstacle).kinks(scene.time.end, scene.time.step)
+            from lyra_petsc.mesh.obstacles import surface_motion  # with frames only
+
+            step = scene.time.step if isinstance(scene.time.step, float) else 0.0
+            jumps += surface_motion(obstacle).kinks(scene.time.end, step)
     windows += [Window(load.start, load.until) for load in scene.loads]
     return [*(t for window in windows for t in window.events()), *jumps]
 
