@@ -189,6 +189,8 @@ def event_times(scene: Scene) -> list[float]:
         if window.start < t < window.until + window.fade
     ]
     for obstacle in (scene.obstacles or {}).values():
+        if keyframes := scene.keyframes(obstacle):
+            jumps += Motion(keyframes, obstacle.interpolation, file=scene.source).velocity_jumps
         if obstacle.mesh is not None and obstacle.mesh.frames is not None:
             from lyra_petsc.mesh.obstacles import surface_motion  # with frames only
 

@@ -54,7 +54,7 @@ def final(comm: MPI.Comm, content: dict[str, Any]) -> np.ndarray[Any, Any]:
     return np.asarray(comm.bcast(positions))
 
 
-@pytest.mark.parametrize("integrator", ["beuler", "bdf2"])
+@pytest.mark.parametrize("integrator", ["beuler", "bdf2", "alpha2"])
 def test_a_translation_by_frames_is_that_by_keyframes(
     comm: MPI.Comm, shared_tmp: Path, integrator: str
 ) -> None:
