@@ -25,6 +25,10 @@ STEEP = 0.2
 REACH, PART = 8.0, 1.0 / 6.0
 """Height up to which pairs are known: over the mean edge, and at most over the size of the smallest piece."""
 
+BODY, BODY_SMOOTHING = 0.5, 3
+"""The same over the radius of a sphere with a closed obstacle's ratio of volume and area, and rounds in which
+normals of obstacles are averaged: their dents are meant."""
+
 OTHER_SURFACE = 2.0
 """Height over the least one of the same part from which on it is that of another surface behind."""
 
@@ -78,14 +82,18 @@ class Surfaces(NamedTuple):
         cross *= np.where(outward < 0.0, -1.0, 1.0)[of_triangle][:, None]
         edges = unique_edges(triangles)
         normals = unit(_summed(triangles.ravel(), np.repeat(cross, 3, axis=0), len(points)))
-        for _ in range(SMOOTHING):
+        rigid = (piece >= n_sheets)[:, None]
+        for number in range(SMOOTHING):
             sums = normals + _summed(edges.T.ravel(), normals[edges[:, ::-1].T.ravel()], len(points))
-            normals = unit(sums)
+            normals = np.where(rigid & (number >= BODY_SMOOTHING), normals, unit(sums))
         double_area = np.repeat(np.linalg.norm(cross, axis=1), 3)
         area: Array = np.bincount(triangles.ravel(), double_area / 6.0, len(points)).astype(np.float64)
         of_sheets = edges[piece[edges[:, 0]] < n_sheets]
         length = np.linalg.norm(points[of_sheets[:, 1]] - points[of_sheets[:, 0]], axis=1)
         sizes = [float(np.linalg.norm(np.ptp(points[piece == k], axis=0))) for k in range(len(volume))]
+        surface = np.bincount(of_triangle, 0.5 * np.linalg.norm(cross, axis=1))
+        bodies = outward != 0.0
+        sizes += (BODY * 3.0 * np.abs(volume)[bodies] / surface[bodies] / PART).tolist()
         reach = min(REACH * float(length.mean()), PART * min(sizes))
         return cls(triangles, edges, piece, n_sheets, outward, normals, area, reach)
 

@@ -77,7 +77,7 @@ class Untangled(NamedTuple):
     pairs : int
         Number of crossings of the start: pairs of triangles, and triangles in obstacles.
     depth : float
-        Depth [m] of the overlap: the largest height on the wrong side, with the distance that is to be kept.
+        Depth [m] of the overlap: the largest distance on the wrong side, with that which is to be kept.
     largest : float
         Largest displacement [m].
     """
@@ -233,7 +233,8 @@ class _Untangling:
             parts = [self._layer_heights(x, crossings), *self._container_heights(x), *self._round_heights(x)]
             heights = joined(parts)
             if not self.depth:
-                self._take_depth(float(-heights.now[heights.wrong].min(initial=0.0)))
+                depths = -(heights.now * heights.slope)[heights.wrong]
+                self._take_depth(float(depths.max(initial=0.0)))
             if not len(crossings) and not (heights.wrong | (heights.now < self._least(heights))).any():
                 break
             y = self._solve(heights, x - self._start)
