@@ -120,7 +120,7 @@ class RestShape:
         Raises
         ------
         InputError
-            Unknown group, an edge in two creases, or a material that slides or yields by curvature at it.
+            Unknown group, or an edge in two creases.
         """
         crease, scene = np.full(len(self.hinges.vertices), -1, dtype=np.int64), self.scene
         for number, block in enumerate(scene.creases):

@@ -115,6 +115,15 @@ def test_loop_of_a_strip_is_that_of_kinematic_hardening(hardening: float) -> Non
     assert stored[30] == pytest.approx(0.5 * B * elastic, rel=5e-3)
 
 
+def test_plastic_bending_and_friction_within_the_fabric_add() -> None:
+    friction, yields_at = 3e-3, 2.0
+    material = SHEET | {"bending_model": "midedge", "friction_moment": friction}
+    moments, heats, _ = measured(loading(material, PATH, 0))
+    one, two = bilinear(PATH, B, YIELD, HARDENING), bilinear(PATH, friction / yields_at, yields_at, 0.0)
+    np.testing.assert_allclose(moments, one[0] + two[0], rtol=0.0, atol=5e-3 * moments.max())
+    assert heats[30] == pytest.approx(one[1][30] + two[1][30], rel=2e-3)
+
+
 def test_loop_of_hinges_across_the_strip() -> None:
     # ends that do not twist keep the diagonals flat: without them it is 0.8 B that hinges have
     moments, heats, _ = measured(loading(SHEET | {"bending_model": "hinge"}, PATH, 1))
@@ -206,10 +215,16 @@ def test_a_yield_curvature_out_of_reach_changes_nothing(model: str) -> None:
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=1e-9)
 
 
+IN_LOOP = loading(SHEET | {"bending_model": "midedge"}, PATH[:19], 0)
+RUNS = {"midedge": falling("beuler", "midedge"), "hinge": falling("beuler", "hinge"), "loop": IN_LOOP}
+
+
 @pytest.mark.parallel(3)
-@pytest.mark.parametrize("model", ["midedge", "hinge"])
-def test_a_run_resumes_on_another_number_of_ranks(model: str, comm: MPI.Comm, shared_tmp: Path) -> None:
-    scene = scene_of(falling("beuler", model))
+@pytest.mark.parametrize(("run", "steps"), [("midedge", 20), ("hinge", 20), ("loop", 14)])
+def test_a_run_resumes_on_another_number_of_ranks(
+    run: str, steps: int, comm: MPI.Comm, shared_tmp: Path
+) -> None:
+    scene = scene_of(RUNS[run])
     simulation = SteppedScene(comm, scene)
     while not simulation.finished:
         simulation.step()
@@ -217,7 +232,7 @@ def test_a_run_resumes_on_another_number_of_ranks(model: str, comm: MPI.Comm, sh
     heat = simulation.energy_balance.budget.dissipation
     assert heat > 5e-7
     simulation.destroy()
-    x = end_on_one_rank(comm, scene, shared_tmp / "run", 20)
+    x = end_on_one_rank(comm, scene, shared_tmp / "run", steps)
     if x is not None:
         np.testing.assert_allclose(x, unbroken, rtol=0.0, atol=1e-8)
         lines = (shared_tmp / "run" / "history.csv").read_text(encoding="utf-8").splitlines()
