@@ -189,6 +189,52 @@ def test_positions_velocities_and_forces_of_the_program(comm: Any, integrator: s
         assert balance <= step.energies["external_work"]
 
 
+DRIVEN = {
+    "gravity": {"gravity": [[0.0, [0, 0, 0]], [0.1, [0, 1, -9.81]]]},
+    "wind.velocity": {"wind": {"velocity": [[0.0, [0, 0, 0]], [0.1, [0, 1, -9.81]]], "density": 1.2}},
+    "loads[0].pressure": {"loads": [{"pressure": [[0.0, 0], [0.1, 4.0]]}]},
+    "loads[0].force": {"loads": [{"nodes": [12], "force": [[0.0, [0, 0, 0]], [0.1, [0, 0.01, 0.02]]]}]},
+}
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "bdf2"])
+@pytest.mark.parametrize("name", DRIVEN)
+def test_a_driven_value_is_one_with_points(comm: Any, name: str, integrator: str) -> None:
+    scene = scene_with(integrator, **DRIVEN[name])
+    if name != "gravity":
+        del scene["gravity"]
+    start = {
+        key: ([0.0] * 3 if key != "pressure" else 0.0) for key in ("gravity", "velocity", "force", "pressure")
+    }
+    key = name.split(".")[-1]
+    still = lyra_petsc.load(scene, {name: start[key]})
+    with lyra_petsc.Simulation(scene) as twin:
+        final = list(twin)[-1]
+        expected = ends(twin)
+    with lyra_petsc.Simulation(still, drives=[name]) as driven:
+        driven.set(
+            name,
+            [0, 1, -9.81] if key in ("gravity", "velocity") else DRIVEN[name]["loads"][0][key][1][1],
+            at=0.1,
+        )
+        step = list(driven)[-1]
+        reached = ends(driven)
+    assert final.energies["kinetic"] > 1e-8
+    assert step.energies == pytest.approx(final.energies, rel=1e-6, abs=1e-12)
+    if comm.rank == 0:
+        np.testing.assert_allclose(reached[0], expected[0], atol=1e-10)
+
+
+def test_a_driven_value_changes_at_once() -> None:
+    with lyra_petsc.Simulation(scene_with("beuler", handles=[]), drives=["gravity"]) as sheet:
+        start = sheet.positions
+        sheet.set("gravity", [0.0, 0.0, 0.0])
+        np.testing.assert_allclose(sheet.step().positions, start, atol=1e-14)
+        sheet.set("gravity", [2.0, 0.0, 0.0])
+        np.testing.assert_allclose(sheet.step().velocities - [0.02, 0.0, 0.0], 0.0, atol=1e-12)
+
+
 def test_a_state_that_crosses_is_refused() -> None:
     floor = {"plane": {"point": [0, 0, -0.1], "normal": [0, 0, 1]}}
     with lyra_petsc.Simulation(SCENE | {"contact": {}, "obstacles": {"floor": floor}}) as sheet:
@@ -205,7 +251,11 @@ def test_mistakes_name_the_call_to_use() -> None:
         lyra_petsc.InputError, match=r"cannot drive 'handle\[0\]', did you mean 'handles\[0\]'"
     ):
         lyra_petsc.Simulation(SCENE, drives=["handle[0]"])
-    with lyra_petsc.Simulation(SCENE, drives=["handles[0]"]) as sheet:
+    with lyra_petsc.Simulation(SCENE, drives=["handles[0]", "gravity"]) as sheet:
+        with pytest.raises(lyra_petsc.InputError, match=r"changed by set\(\), not move\(\)"):
+            sheet.move("gravity", translate=[0, 0, 1])
+        with pytest.raises(lyra_petsc.InputError, match="must be three finite numbers"):
+            sheet.set("gravity", 9.81)
         with pytest.raises(lyra_petsc.InputError, match=r"row for each of \.vertices"):
             sheet.positions = np.zeros((3, 3))
         with pytest.raises(lyra_petsc.InputError, match="not finite"):
