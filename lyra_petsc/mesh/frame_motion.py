@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh.frame_files import FrameFile
+from lyra_petsc.mesh.frame_files import FrameFile, Source, open_frames
 from lyra_petsc.mesh.interpolation import hermite, without_overshoot
+from lyra_petsc.scene.schema import Handle
 
 KEPT = 4
 """Number of frames in memory: a cubic polynomial between two frames depends on the four around."""
@@ -159,3 +161,51 @@ class FrameMotion:
         """Mean time [s] between frames; infinite for one frame."""
         times = self.frames.times
         return float(times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else np.inf
+
+
+class HandleFrames:
+    """The motion of a handle's vertices through frames, from where they are at its start.
+
+    Parameters
+    ----------
+    motion : FrameMotion
+        Of these vertices.
+    """
+
+    def __init__(self, motion: FrameMotion) -> None:
+        self.motion = motion
+        self._start: tuple[float, Array] | None = None
+
+    def moved(self, points: Array, start: float, time: float) -> Array:
+        """Positions (n, 3) [m] of ``points``, which move by the frames' displacements since ``start`` [s]."""
+        if self._start is None or self._start[0] != start:
+            self._start = start, self.motion.positions(start)
+        return points + (self.motion.positions(time) - self._start[1])
+
+    def velocity(self, points: Array, start: float, time: float) -> Array:
+        """Time derivative (n, 3) [m/s] of ``moved``."""
+        return self.motion.velocities(time)
+
+
+def handle_frames(handle: Handle) -> FrameMotion:
+    """The motion of all points in the frames of a handle.
+
+    Raises
+    ------
+    InputError
+        If its files cannot be read as frames.
+    """
+    assert handle.frames is not None
+    return FrameMotion(open_frames(handle.frames, handle.fps), handle.interpolation, repeat=handle.repeat)
+
+
+def frames_of(handle: Handle, vertices: Ints, group: Ints, n_vertices: int) -> HandleFrames:
+    """The motion of some ``vertices`` of a handle's ``group`` (ascending) in a mesh of ``n_vertices``.
+
+    Frames have all vertices of the mesh, or those of the group in the order of the mesh.
+    """
+    frames = open_frames(cast("Source", handle.frames), handle.fps)
+    whole = len(frames.read(0)) == n_vertices
+    rows = vertices if whole else np.searchsorted(group, vertices)
+    motion = FrameMotion(frames, handle.interpolation, repeat=handle.repeat, chosen=lambda x: x[rows])
+    return HandleFrames(motion)

@@ -233,10 +233,18 @@ class Handle(Selector):
         ``axes``; needs ``midedge``.
     motion : str or None
         Name in ``motions``; without it the vertices keep their positions.
+    frames : Path or list of Path or None
+        Positions of the vertices in files, as ``frames`` of an obstacle's mesh: those of the group in the
+        order of the mesh, or of all vertices. The vertices move by the frames' displacements, from where they
+        are when the handle begins to act.
+    fps : float [1/s] or None
+        Frames per second, for files without times.
+    repeat : bool
+        Whether frames begin again after the last one, as those of an obstacle's mesh.
     interpolation : str
-        Interpolation of the motion between keyframes. ``monotone``: smooth, and never beyond two neighbouring
-        keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes before a hold;
-        ``linear``.
+        Interpolation of the motion between keyframes or frames. ``monotone``: smooth, and never beyond two
+        neighbouring keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes
+        before a hold; ``linear``.
     start, until : float [s]
         The handle acts for from ≤ t ≤ until; by default always.
     fade : float [s]
@@ -249,6 +257,9 @@ class Handle(Selector):
     clamp: Flag = False
     symmetry: Direction | None = None
     motion: Name | None = None
+    frames: FramesPath | None = None
+    fps: Positive | None = None
+    repeat: Flag = False
     interpolation: Interpolation = "monotone"
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
@@ -278,6 +289,13 @@ class Handle(Selector):
             not self.clamp or self.stiffness is None or self.axes == AXES,
             "keeps no slope of an edge that springs hold along some axes; hold all axes, or leave clamp out",
             "clamp",
+        )
+        _check_frames(self)
+        others = self.clamp or self.fade > 0.0 or self.present("motion", "stiffness", "symmetry")
+        self.require_with(
+            "frames",
+            not others,
+            "move vertices that nothing else moves; leave out clamp, fade, motion, stiffness and symmetry",
         )
         others = self.clamp or self.start > 0.0 or self.fade > 0.0 or self.present("motion", "stiffness")
         self.require_with(
@@ -486,7 +504,7 @@ class ObstacleMesh(Block):
         _check_frames(self)
 
 
-def _check_frames(block: ObstacleMesh) -> None:
+def _check_frames(block: Handle | ObstacleMesh) -> None:
     for key in ("fps", "repeat"):
         if block.get(key):
             require(block.frames is not None, "is for frames, which are absent", key)
@@ -959,13 +977,15 @@ class Scene(Block):
             if obstacle.mesh is not None:
                 files["obstacles", name, "mesh", "file"] = obstacle.mesh.file
                 files |= _frame_files(obstacle.mesh.frames, "obstacles", name, "mesh", "frames")
+        for i, handle in enumerate(self.handles):
+            files |= _frame_files(handle.frames, "handles", i, "frames")
         return files
 
     @property
     def has_frames(self) -> bool:
         """Whether anything moves through frames."""
         meshes = (obstacle.mesh for obstacle in (self.obstacles or {}).values())
-        return any(mesh is not None and mesh.frames is not None for mesh in meshes)
+        return any(block is not None and block.frames is not None for block in (*meshes, *self.handles))
 
     @property
     def has_scripts(self) -> bool:

@@ -53,6 +53,7 @@ from lyra_petsc.terms.units_check import unit_notes
 if TYPE_CHECKING:
     from lyra_petsc.contact.contact_setup import Barrier
     from lyra_petsc.contact.scene_contact import SceneContact
+    from lyra_petsc.mesh.frame_motion import HandleFrames
     from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
 
 
@@ -196,6 +197,13 @@ def event_times(scene: Scene) -> list[float]:
 
             step = scene.time.step if isinstance(scene.time.step, float) else 0.0
             jumps += surface_motion(obstacle).kinks(scene.time.end, step)
+    for handle, window in zip(scene.handles, list(windows), strict=False):
+        if handle.frames is not None:
+            from lyra_petsc.mesh.frame_motion import handle_frames  # with frames only
+
+            step = scene.time.step if isinstance(scene.time.step, float) else 0.0
+            kinks = handle_frames(handle).kinks(scene.time.end, step)
+            jumps += [t for t in kinks if window.start < t < window.until]
     windows += [Window(load.start, load.until) for load in scene.loads]
     return [*(t for window in windows for t in window.events()), *jumps]
 
@@ -214,6 +222,7 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
     held = select_exact(scene, mesh)
     _check_symmetry(rest, held)
     _check_sliding(rest, held)
+    _check_handle_frames(scene, mesh, held)
     elements: dict[str, Elements] = {}
     names: list[str] = []
     for entry in (needed := needed_terms(scene, rest.shells)):
@@ -440,6 +449,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
         scene,
         {n: part.vertex_sets["handle", n] for n, handle in enumerate(scene.handles) if is_exact(handle)},
         _clamped_edges(scene, part, terms),
+        _handle_frames(scene, part),
     )
     mass = np.zeros(layout.n_owned)
     mass[: layout.n_vertices] = part.vertex_data["mass"]
@@ -540,6 +550,32 @@ def refuse_contact(equations: StageEquations, scene: Scene, when: str, minimum: 
         file=scene.source,
         key=f"obstacles.{near.obstacle}" if near.obstacle in (scene.obstacles or {}) else "contact",
     )
+
+
+def _handle_frames(scene: Scene, part: LocalMesh) -> dict[int, HandleFrames]:
+    """The motions of handles by frames, of the vertices of this rank; collective."""
+    motions: dict[int, HandleFrames] = {}
+    for number, handle in enumerate(scene.handles):
+        if handle.frames is not None:
+            from lyra_petsc.mesh.frame_motion import frames_of  # with frames only
+
+            layout = part.layout
+            vertices = layout.mesh_vertices[part.vertex_sets["handle", number]]
+            group = np.sort(np.concatenate(layout.comm.allgather(vertices)))
+            motions[number] = frames_of(handle, vertices, group, layout.n_vertices_global)
+    return motions
+
+
+def _check_handle_frames(scene: Scene, mesh: Mesh, held: Selection) -> None:
+    """Refuse frames of handles that cannot be used (rank 0)."""
+    for number, vertices in held.items():
+        handle = scene.handles[number]
+        if handle.frames is not None:
+            from lyra_petsc.mesh.frame_files import check_frames  # with frames only
+            from lyra_petsc.mesh.frame_motion import handle_frames
+
+            counts = len(vertices), mesh.n_vertices
+            check_frames(handle_frames(handle).frames, counts, f"handles[{number}] or the mesh has")
 
 
 def _clamped_edges(scene: Scene, part: LocalMesh, terms: Mapping[str, Term]) -> ClampedEdges | None:

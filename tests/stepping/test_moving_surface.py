@@ -13,7 +13,7 @@ from physics import grid
 from lyra_petsc.api.simulations import Simulation
 from lyra_petsc.mesh.obstacles import BOX_TRIANGLES
 
-pytestmark = pytest.mark.parallel(2)
+pytestmark = pytest.mark.parallel
 
 CORNERS = np.array([[x, y, z] for z in (-0.1, 0.0) for y in (-0.3, 0.3) for x in (-0.3, 0.3)])
 TIMES = [0.0, 0.05, 0.1, 0.2]
@@ -67,3 +67,27 @@ def test_a_translation_by_frames_is_that_by_keyframes(
     by_frames = final(comm, scene(shared_tmp, integrator, frames=str(shared_tmp / "walk.npz")))
     assert np.abs(by_keyframes[:, 0]).max() > 0.4
     assert np.abs(by_frames - by_keyframes).max() < 1e-6
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_vertices_pulled_by_frames_move_as_by_keyframes(
+    comm: MPI.Comm, shared_tmp: Path, whole: bool
+) -> None:
+    content: dict[str, Any] = {
+        "mesh": grid(0.8, 0.8, 6, 6),
+        "material": {"cloth": "gray-interlock", "damping": 0.02},
+        "handles": [{"group": "left", "motion": "pull", "interpolation": "linear"}, {"group": "right"}],
+        "motions": {"pull": KEYFRAMES},
+        "gravity": [0, 0, -9.81],
+        "time": {"end": 0.2, "step": 0.01},
+        "solver": {"force_tolerance": 1e-12},
+    }
+    by_keyframes = final(comm, content)
+    if comm.rank == 0:
+        rows = np.arange(49) if whole else 7 * np.arange(7)
+        places = np.stack([rows % 7, rows // 7, 0 * rows], axis=1) * (0.8 / 6)
+        np.savez(shared_tmp / "pins.npz", time=TIMES, position=places + np.array(SHIFTS)[:, None])
+    comm.barrier()
+    pulled = {"group": "left", "frames": str(shared_tmp / "pins.npz"), "interpolation": "linear"}
+    by_frames = final(comm, content | {"handles": [pulled, {"group": "right"}]})
+    assert np.abs(by_frames - by_keyframes).max() < 1e-9

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import combinations, pairwise
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from lyra_petsc.scene.schema import Handle, Scene
 from lyra_petsc.terms.handles.motion import Motion, Window, motion_of
 
 if TYPE_CHECKING:
+    from lyra_petsc.mesh.frame_motion import HandleFrames
     from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
 
 Selection = dict[int, NDArray[np.int64]]
@@ -67,7 +68,8 @@ def conflicts(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
     notes = []
     windows = {number: Window.of(scene.handles[number]) for number in held}
     slack = SAME_PLACE * float(np.ptp(mesh.positions, axis=0).max())
-    for first, second in combinations(held, 2):
+    by_keyframes = [number for number in held if scene.handles[number].frames is None]
+    for first, second in combinations(by_keyframes, 2):
         start = max(windows[first].start, windows[second].start)
         end = min(windows[first].until, windows[second].until, scene.time.end)
         shared = sorted(set(scene.handles[first].axis_numbers) & set(scene.handles[second].axis_numbers))
@@ -119,19 +121,28 @@ class ExactHandles:
         Owned vertices of each exact handle, local numbering.
     edges : ClampedEdges or None
         Edges whose unknowns are also prescribed.
+    frames : mapping of handle number → HandleFrames
+        Motions of handles by frames from files.
 
     Attributes
     ----------
     edges : ClampedEdges or None
     """
 
-    def __init__(self, scene: Scene, owned: Selection, edges: ClampedEdges | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        owned: Selection,
+        edges: ClampedEdges | None = None,
+        frames: Mapping[int, HandleFrames] | None = None,
+    ) -> None:
         self._vertices, self.edges = owned, edges
         self._axes = {
             number: np.array(scene.handles[number].axis_numbers, dtype=np.int64) for number in owned
         }
         self._indices = {number: np.ix_(vertices, self._axes[number]) for number, vertices in owned.items()}
-        self._motions: dict[int, Motion] = {number: motion_of(scene, number) for number in owned}
+        self._motions: dict[int, Motion | HandleFrames] = {n: motion_of(scene, n) for n in owned}
+        self._motions |= frames or {}
         self._windows = {number: Window.of(scene.handles[number]) for number in owned}
         self._windows |= edges.windows if edges is not None else {}
 
