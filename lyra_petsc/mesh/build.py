@@ -338,7 +338,9 @@ def build_mesh(
             sheet = _read(source, trust_scripts, report)
             piece = _check_and_transform(sheet, source, key, file)
         except MemoryError:
-            raise InputError("the mesh does not fit into memory", file=source.file or file, key=key) from None
+            raise InputError(
+                "the mesh does not fit into memory", file=source.file or source.pattern or file, key=key
+            ) from None
         label = source.name or (source.file.name if source.file is not None else "grid")
         notes += [f"{label}: {note}" for note in sheet.notes]
         first = n_vertices, n_triangles
@@ -360,6 +362,14 @@ def build_mesh(
 def _read(source: MeshSource, trust_scripts: bool, report: Callable[[str], None] | None) -> Sheet:
     if source.grid is not None:
         return grid_sheet(source.grid)
+    if source.pattern is not None:
+        from lyra_petsc.mesh.pattern_panel import read_panel  # only patterns need it
+
+        assert source.panel is not None
+        assert source.size is not None
+        return read_panel(
+            source.pattern, source.panel, source.size, algorithm=source.algorithm, report=report
+        )
     assert source.file is not None
     suffix = source.file.suffix.lower()
     if suffix == ".msh":
@@ -379,7 +389,8 @@ def _read(source: MeshSource, trust_scripts: bool, report: Callable[[str], None]
 
 def _check_and_transform(sheet: Sheet, source: MeshSource, key: str, file: object | None) -> Mesh:
     # a grid has no file: messages name the scene and its key
-    where = {"file": source.file} if source.file is not None else {"file": file, "key": f"{key}.grid"}
+    read_from = source.file or source.pattern
+    where = {"file": read_from} if read_from is not None else {"file": file, "key": f"{key}.grid"}
     check_topology(sheet, **where)
     if source.weld is not None:
         _weld(sheet, source, source.weld, where)

@@ -113,6 +113,13 @@ def _load_checked(
     *,
     meshes_needed: bool = True,
 ) -> Scene:
+    sources = data.get("mesh") if isinstance(data, dict) else None
+    if any(
+        isinstance(s, dict) and "pattern" in s for s in (sources if isinstance(sources, list) else [sources])
+    ):
+        from lyra_petsc.scene.pattern_file import expand_patterns  # only scenes with patterns need it
+
+        data = expand_patterns(data, directory, source)
     with _refuse_recursion(source):
         scene = validated(Scene, data, file=source, overridden=overridden, context={"directory": directory})
     if meshes_needed:

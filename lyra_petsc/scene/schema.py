@@ -126,7 +126,7 @@ MeshPath = Annotated[Path, file_beside("mesh file", *MESH_SUFFIXES)]
 
 
 class MeshSource(Block):
-    """Source of one sheet: a file or a grid.
+    """Source of one sheet: a file or a grid; or of all sheets and seams of a garment pattern.
 
     Attributes
     ----------
@@ -135,10 +135,17 @@ class MeshSource(Block):
         scene file.
     grid : Grid or None
         A rectangular grid instead of a file.
+    pattern : Path or None
+        A garment pattern of GarmentCode (NAME_specification.json): a sheet for each panel, with its name and
+        groups ``edge0``, ``edge1``, …, and a seam for each stitch, which closes in the first second;
+        ``seams`` of the scene between the same groups replace these. Units are those of the file, y is up.
+    panel : str or None
+        This panel of the pattern alone, without seams.
     size : float [m] or None
-        Element size for a .geo file; replaces the sizes in the script.
+        Element size for a .geo file, where it replaces the sizes in the script, or for a pattern.
     algorithm : str or None
-        gmsh's algorithm for the triangles of a .geo file; by default that of the script, or gmsh's default.
+        gmsh's algorithm for the triangles of a .geo file or a pattern; by default that of the script, or
+        gmsh's default.
     transform : Transform
         Transform from the mesh to the start positions. Its scaling applies to the rest shape, too, unless
         ``vt`` give the rest shape.
@@ -153,6 +160,8 @@ class MeshSource(Block):
 
     file: MeshPath | None = None
     grid: Grid | None = None
+    pattern: Annotated[Path, file_beside("pattern", ".json")] | None = None
+    panel: Name | None = None
     size: Positive | None = None
     algorithm: Literal["automatic", "mesh-adapt", "delaunay", "frontal-delaunay"] | None = None
     transform: Transform = Field(default_factory=Transform)
@@ -162,13 +171,23 @@ class MeshSource(Block):
 
     def check(self) -> None:
         """Refuse keys for other kinds of files."""
-        self.require_one("file", "grid")
+        self.require_one("file", "grid", "pattern")
+        self.require_with("panel", self.pattern is not None, "is a panel of a pattern")
+        if self.pattern is not None:
+            require(self.size is not None, "needs size, the element size [m]", "pattern")
         suffix = self.file.suffix.lower() if self.file is not None else ""
         for key in ("size", "algorithm"):
             self.require_with(
-                key, suffix == ".geo", "is for .geo files only (others come with their elements)"
+                key,
+                suffix == ".geo" or self.pattern is not None,
+                "is for .geo files and patterns only (others come with their elements)",
             )
         self.require_with("uv", suffix == ".obj", "is for .obj files only (others have no vt)")
+
+    @classmethod
+    def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """A panel's sheet has its name."""
+        return data | ({"name": data["panel"]} if "panel" in data and "name" not in data else {})
 
 
 MAX_SPEED = 1e8
@@ -973,6 +992,8 @@ class Scene(Block):
         for i, source in enumerate(self.mesh):
             if source.file is not None:
                 files["mesh", i, "file"] = source.file
+            if source.pattern is not None:
+                files["mesh", i, "pattern"] = source.pattern
         for name, obstacle in (self.obstacles or {}).items():
             if obstacle.mesh is not None:
                 files["obstacles", name, "mesh", "file"] = obstacle.mesh.file
