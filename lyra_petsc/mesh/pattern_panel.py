@@ -17,6 +17,9 @@ from lyra_petsc.mesh.mesh import NamedSet, Sheet
 from lyra_petsc.mesh.readers import printable
 from lyra_petsc.scene.pattern_file import Panel, Pattern, outline, read_pattern
 
+SAME_POINT = 1e-9
+"""Distance over the extent of a panel below which two points of its outline are one."""
+
 
 def read_panel(
     path: Path,
@@ -109,7 +112,7 @@ def _refuse_crossings(points: Array, edge_of: Ints, path: Path, key: str) -> Non
     n = len(points)
     if n < 3:
         raise InputError("has fewer than three sides", file=path, key=key)
-    following = np.roll(points, -1, axis=0)
+    following, extent = np.roll(points, -1, axis=0), np.ptp(points)
 
     def side(a: Array, b: Array, c: Array) -> Array:
         return np.asarray(
@@ -128,8 +131,8 @@ def _refuse_crossings(points: Array, edge_of: Ints, path: Path, key: str) -> Non
             )
             for end in (p, q)
         ]
-        in_line = (ends[0] == 0) & (ends[1] == 0)
-        crossing = np.flatnonzero((of_p <= 0) & (ends[0] * ends[1] <= 0) & ~in_line)
+        meet = np.abs(p - a).max(axis=1) <= SAME_POINT * extent
+        crossing = np.flatnonzero((of_p < 0) & (ends[0] * ends[1] < 0) | meet)
         if len(crossing):
             one, other = edge_of[i], edge_of[i + 2 + crossing[0]]
             where = ", ".join(f"{x:.4g}" for x in a)
