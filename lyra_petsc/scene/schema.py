@@ -180,7 +180,7 @@ class MeshSource(Block):
             self.require_with(
                 key,
                 suffix == ".geo" or self.pattern is not None,
-                "is for .geo files and patterns only (others come with their elements)",
+                "is for patterns and .geo files only (others come with their elements)",
             )
         self.require_with("uv", suffix == ".obj", "is for .obj files only (others have no vt)")
 
