@@ -169,7 +169,7 @@ def dented(folder: Path, depth: float) -> dict[str, Any]:
         mesh.append(file | {"name": f"sheet{number}"})
     return {
         "mesh": mesh,
-        "material": {"young": 1e5, "poisson": 0.3, "thickness": 1e-3, "density": 200.0},
+        "material": {"young": 1e5, "poisson": 0.3, "thickness": 1e-3, "density": 0.2},
         "handles": [
             {"box": [[-0.1, -0.1, -0.1], [0.001, 0.4, 0.1]]},
             {"box": [[0.299, -0.1, -0.1], [0.4, 0.4, 0.1]]},
