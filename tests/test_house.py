@@ -103,7 +103,7 @@ def test_names_of_classes_and_modules_occur_once() -> None:
 OF_CONTACT = {
     "SceneContact", "set_up_terms", "Barrier", "barrier", "RefusedDisplacement", "ContactModel", "NearPair",
     "Overlaps", "behind_wall", "find_overlaps", "refuse_crossings", "StartCrossings",
-    "have_common_vertex", "self_crossings", "untangle",
+    "have_common_vertex", "self_crossings", "untangle", "crossings_beside_seams",
 }  # fmt: skip
 """All that other packages import from `lyra_petsc.contact`."""
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Ints
-from lyra_petsc.contact.crossings import have_common_vertex, self_crossings
+from lyra_petsc.contact.crossings import have_common_vertex
+from lyra_petsc.contact.joined import crossings_beside_seams
 from lyra_petsc.contact.overlaps import Overlaps, behind_wall, find_overlaps
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container, Solid
@@ -22,6 +23,8 @@ from lyra_petsc.show.obstacle_surfaces import run_obstacles
 
 if TYPE_CHECKING:
     from mpi4py import MPI
+
+NO_TIES: Ints = np.empty((0, 2), dtype=np.int64)
 
 
 class StateCrossings(NamedTuple):
@@ -53,16 +56,39 @@ def run_walls(run: StoredRun) -> list[Wall]:
     scene = run.scene
     if scene.contact is None or not any(handle.symmetry for handle in scene.handles):
         return []
+    return symmetry_walls(scene, _mesh_of(run))
+
+
+def _mesh_of(run: StoredRun) -> Mesh:
+    """The mesh of a run, without rest angles."""
     stored, flat_rest = run.mesh, np.zeros(len(run.triangles), dtype=bool)
     start = run.positions[0] if stored.start is None else stored.start
-    arrays = start, stored.rest, stored.triangles, stored.corner_uv, flat_rest
-    return symmetry_walls(scene, Mesh(*arrays, stored.groups))
+    return Mesh(start, stored.rest, stored.triangles, stored.corner_uv, flat_rest, stored.groups)
+
+
+def run_ties(run: StoredRun) -> Ints:
+    """Pairs of vertices (n, 2) that the seams of a run hold together.
+
+    Raises
+    ------
+    InputError
+        If files of the run are gone or damaged.
+    """
+    if not run.scene.seams:
+        return NO_TIES
+    from lyra_petsc.mesh.seams import tied_pairs
+
+    return tied_pairs(run.scene, _mesh_of(run))
 
 
 def crossings_of(
-    run: StoredRun, obstacles: Sequence[Solid | Container], state: int, walls: Sequence[Wall] = ()
+    run: StoredRun,
+    obstacles: Sequence[Solid | Container],
+    state: int,
+    walls: Sequence[Wall] = (),
+    tied: Ints = NO_TIES,
 ) -> StateCrossings:
-    """Crossings in a state of a run with these obstacles and symmetry planes.
+    """Crossings in a state of a run with these obstacles, symmetry planes and `run_ties`.
 
     Raises
     ------
@@ -70,7 +96,7 @@ def crossings_of(
         If files of the run are gone or damaged.
     """
     x, time = run.positions[state], float(run.times[state])
-    pairs = self_crossings(x, run.triangles)
+    pairs = crossings_beside_seams(x, run.triangles, tied)
     at_corner = have_common_vertex(run.triangles, pairs)
     boxes = {name for name, block in (run.scene.obstacles or {}).items() if block.box is not None}
     overlaps = {
@@ -113,6 +139,7 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     scene = on_root(comm, lambda: run.scene)
     obstacles = on_every_rank(comm, lambda: run_obstacles(run))
     walls = on_every_rank(comm, lambda: run_walls(run))
+    tied = on_every_rank(comm, lambda: run_ties(run))
     row = PAIRS + (INSIDE if scene.obstacles or walls else "")
     time = "load factor" if scene.time.static else "time [s]"
     heads = ("no common vertex", "one common vertex", "vertices in", "edges in", "triangles in")
@@ -120,7 +147,9 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     _print(comm, row.format("state", time, *heads) + "first")
     rows = []
     for begin in range(0, len(run), comm.size):
-        counted = on_every_rank(comm, partial(_count_in_state, run, obstacles, walls, begin + comm.rank))
+        counted = on_every_rank(
+            comm, partial(_count_in_state, run, obstacles, walls, tied, begin + comm.rank)
+        )
         for state, one in enumerate(comm.allgather(counted), start=begin):
             if one is not None:
                 rows.append(one[0])
@@ -138,12 +167,12 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
 
 
 def _count_in_state(
-    run: StoredRun, obstacles: Sequence[Solid | Container], walls: Sequence[Wall], state: int
+    run: StoredRun, obstacles: Sequence[Solid | Container], walls: Sequence[Wall], tied: Ints, state: int
 ) -> tuple[list[int], str] | None:
     """Counts of a state for its row of the table, and the names to print; None beyond the last state."""
     if state >= len(run):
         return None
-    crossings = crossings_of(run, obstacles, state, walls)
+    crossings = crossings_of(run, obstacles, state, walls, tied)
     inside = [[len(part) for part in overlap] for overlap in crossings.overlaps.values()]
     in_all = np.sum(inside, axis=0, dtype=int).tolist() if inside else [0, 0, 0]
     pairs = np.concatenate([crossings.pairs[:MAX_NAMED], crossings.corner_pairs[:MAX_NAMED]])[:MAX_NAMED]

@@ -23,6 +23,7 @@ from lyra_petsc.contact.barrier_law import barrier as barrier_law
 from lyra_petsc.contact.barrier_pairs import barrier_pairs
 from lyra_petsc.contact.contact_search import ContactSearch
 from lyra_petsc.contact.contact_setup import HALFWAY_CURVATURE, Barrier, surface_elements
+from lyra_petsc.contact.joined import JoinedVertices
 from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles
 from lyra_petsc.contact.one_sided import Springs
 from lyra_petsc.contact.pair_distances import EDGE_EDGE
@@ -86,14 +87,20 @@ class ContactBarrier(LimitsStep):
         self.set_pairs(no_near_pairs(), self.stencil, 0)
 
     def set_up(
-        self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, self_contact: bool, static: bool
+        self,
+        barrier: Barrier,
+        obstacles: Sequence[Solid | Container],
+        joined: JoinedVertices,
+        *,
+        self_contact: bool,
+        static: bool,
     ) -> None:
         """Take the data that are the same on all ranks; must be called first.
 
         ``self_contact``: sheets repel each other and themselves; ``static``: an equilibrium is computed.
         """
         self.barrier, self.static = barrier, static
-        self.search.set_up(barrier, obstacles, self_contact=self_contact, static=static)
+        self.search.set_up(barrier, obstacles, joined, self_contact=self_contact, static=static)
 
     @property
     def obstacles(self) -> Obstacles:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact.contact_setup import AREA_UNITS, Barrier
+from lyra_petsc.contact.joined import JoinedVertices
 from lyra_petsc.contact.obstacle_points import Obstacles
 from lyra_petsc.contact.obstacle_search import ObstacleSearch
 from lyra_petsc.contact.pair_distances import EDGE_EDGE
@@ -71,9 +72,16 @@ class ContactSearch:
         self._walled = np.empty((0, 0), dtype=np.bool_)  # walls that act on each vertex
 
     def set_up(
-        self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, self_contact: bool, static: bool
+        self,
+        barrier: Barrier,
+        obstacles: Sequence[Solid | Container],
+        joined: JoinedVertices,
+        *,
+        self_contact: bool,
+        static: bool,
     ) -> None:
         """Take the data that are the same on all ranks; must be called first."""
+        self._joined = joined
         walls = barrier.walls, -0.5 * barrier.thickness  # at half of the distance of a vertex from its image
         self.obstacles, self._gap = Obstacles(obstacles, barrier.flat, *walls), barrier.gap
         self._self_contact, self._static = self_contact, static
@@ -139,7 +147,7 @@ class ContactSearch:
             pairs = self._sheets.pairs(x, dx, numbers, radius, edge_radius, boxes, limit)
             if pairs is None:
                 return None
-            parts.append(pairs)
+            parts.append(self._without_seams(pairs, numbers))
         every = np.concatenate(parts)
         if len(every) > limit:
             return None
@@ -157,6 +165,17 @@ class ContactSearch:
         vertices = numbers[np.where(sheet, points, first[:, None])]
         obstacle_points = np.where(sheet, 0, points)
         return NearPairs(vertices, kind, obstacle, obstacle_points, every[:, 6], units, narrowing)
+
+    def _without_seams(self, pairs: Ints, numbers: Ints) -> Ints:
+        """The rows of `SheetSearch.pairs` without those between parts that a seam holds together."""
+        if not self._joined:
+            return pairs
+        points = numbers[pairs[:, 2:6]]
+        rows = self._joined.concern(points)
+        held = self._joined.between(points[rows], points[rows])
+        of_edges, of_vertex = held[:, :2, 2:].any(axis=(1, 2)), held[:, 0, 1:].any(axis=1)
+        left_out = np.where(pairs[rows, 0] == EDGE_EDGE, of_edges, of_vertex)
+        return np.delete(pairs, rows[left_out], axis=0)
 
     def _symmetry_planes(self, x: Array, points: Ints) -> Ints:
         """Number of symmetry planes in which all vertices of pairs of edges ``points`` (m, 4) lie, (m,)."""

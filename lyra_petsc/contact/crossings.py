@@ -207,6 +207,15 @@ def have_common_vertex(triangles: Ints, pairs: Ints) -> Mask:
     return np.asarray((first[:, :, None] == second[:, None, :]).any(axis=(1, 2)))
 
 
+def still_cross(shapes: Array) -> Mask:
+    """Whether the two triangles of each of ``shapes`` (n, 2, 3, 3) [m] cross, (n,): exact and slow."""
+    points, n = shapes.reshape(-1, 3), len(shapes)
+    triangles = np.arange(6 * n).reshape(n, 2, 3)
+    pairs = np.repeat(np.arange(n)[:, None], 2, axis=1)
+    kept = _decide_exactly(points, triangles[:, 0], triangles[:, 1], pairs, np.zeros(n, dtype=bool))
+    return np.isin(pairs[:, 0], kept[:, 0])
+
+
 def _decide_exactly(points: Array, triangles: Ints, others: Ints, pairs: Ints, decided: Mask) -> Ints:
     """The pairs that cross, in lexicographic order: those decided, and others by rational numbers."""
     kept = decided.copy()

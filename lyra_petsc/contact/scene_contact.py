@@ -7,12 +7,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.contact.collisions import Collisions
 from lyra_petsc.contact.contact_report import ContactReport
 from lyra_petsc.contact.contact_setup import Barrier
 from lyra_petsc.contact.friction import CoulombFriction
+from lyra_petsc.contact.joined import JoinedVertices
 from lyra_petsc.contact.pair_search import PairSearch
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.obstacles import Container, Solid
@@ -32,12 +33,19 @@ of the contact search, up to which the step resolves contact."""
 
 
 def set_up_terms(
-    terms: Mapping[str, Term], barrier: Barrier, obstacles: Sequence[Solid | Container], scene: Scene
+    terms: Mapping[str, Term],
+    barrier: Barrier,
+    obstacles: Sequence[Solid | Container],
+    tied: Ints,
+    scene: Scene,
 ) -> None:
-    """Give the terms of a scene with contact the data that are the same on all ranks."""
+    """Give the terms of a scene with contact the data that are the same on all ranks; ``tied`` (n, 2) are
+    the global numbers of vertices that are held together.
+    """
     assert scene.contact is not None
     contact = cast(ContactBarrier, terms["contact"])
-    contact.set_up(barrier, obstacles, self_contact=scene.contact.self, static=scene.time.static)
+    joined, own = JoinedVertices(tied), scene.contact.self
+    contact.set_up(barrier, obstacles, joined, self_contact=own, static=scene.time.static)
     if "friction" in terms:
         cast(CoulombFriction, terms["friction"]).set_up(contact)
 

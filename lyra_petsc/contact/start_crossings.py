@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.contact.crossings import mutual_crossings, self_crossings
+from lyra_petsc.contact.crossings import mutual_crossings
+from lyra_petsc.contact.joined import crossings_beside_seams
 from lyra_petsc.contact.overlaps import behind_wall, find_overlaps
 from lyra_petsc.errors import MarkedError
 from lyra_petsc.mesh.mesh import Mesh, TriangleSurface
@@ -90,7 +91,7 @@ def find_start_crossings(
         for one in obstacles
         if isinstance(one, Solid) and len(one.triangles)
     }
-    if scene.contact.self and len(pairs := self_crossings(positions, triangles)):
+    if scene.contact.self and len(pairs := crossings_beside_seams(positions, triangles, mesh.tied)):
         segments = intersections(positions[triangles[pairs[:, 0]]], positions[triangles[pairs[:, 1]]])
         crossings.append(
             Crossing(

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -212,7 +214,7 @@ def _add_groups(
     """Add the groups of a source to ``members``; ``first``: numbers of its first vertex and triangle."""
     named = [(group.name, group.dimension, group.members + first[group.dimension == 2]) for group in groups]
     if source is not None:
-        named += [(f"{source}.{name}", dimension, numbers) for name, dimension, numbers in named]
+        named += [(f"{source}/{name}", dimension, numbers) for name, dimension, numbers in named]
         named.append((source, 2, np.arange(first[1], first[1] + n_triangles, dtype=np.int64)))
     for name, dimension, numbers in named:
         members.setdefault((name, dimension), []).append(numbers)
@@ -248,7 +250,14 @@ def _group(dimension: int, members: Ints, triangles: Ints) -> Group:
 
 def build_scene_mesh(scene: Scene, report: Callable[[str], None] | None = None) -> Mesh:
     """The mesh of a scene's sheets (`build_mesh`), with the surfaces of its obstacles."""
-    mesh = build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, report=report)
+    sewn = None
+    if scene.seams:
+        from lyra_petsc.mesh.seams import join_seams  # only scenes with seams need it
+
+        sewn = partial(join_seams, scene)
+    mesh = build_mesh(
+        scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, report=report, sewn=sewn
+    )
     for name, obstacle in (scene.obstacles or {}).items():
         if obstacle.mesh is not None:
             source = MeshSource(file=obstacle.mesh.file, transform=obstacle.mesh.transform)
@@ -299,11 +308,12 @@ def build_mesh(
     file: object | None = None,
     trust_scripts: bool = False,
     report: Callable[[str], None] | None = None,
+    sewn: Callable[[Mesh], Mesh] | None = None,
 ) -> Mesh:
     """Read, transform, check and join the mesh sources of a scene.
 
     Vertices are numbered consecutively over the sources, in file order within each source. A named source
-    is a surface group of its name; its own groups can also be called ``source.group``. Groups of equal name
+    is a surface group of its name; its own groups can also be called ``source/group``. Groups of equal name
     in several sources are one group. Where groups of different dimension have one name, the surface (else
     the curve) keeps it and the others become ``name.curve`` and ``name.point``, with a note.
 
@@ -318,6 +328,8 @@ def build_mesh(
         As ``trusted`` of `library_file.read_by_library`.
     report : callable, optional
         Called with a line of progress at intervals while gmsh works.
+    sewn : callable, optional
+        Returns the mesh of all sources with its seams.
 
     Raises
     ------
@@ -353,9 +365,17 @@ def build_mesh(
     mesh = _join(pieces)
     mesh.groups, group_notes = _named_groups(members, mesh.triangles)
     mesh.sources = listed
-    mesh.coincident, mesh.unconnected = _coincident(mesh)
-    mesh.notes = notes + group_notes + [mesh.unconnected] * (mesh.unconnected != "")
     mesh.tags = np.concatenate(tags) if any(numbers.any() for numbers in tags) else None
+    mesh.notes = notes + group_notes
+    if sewn is not None:
+        mesh = sewn(mesh)
+        sheet = Sheet(mesh.positions, mesh.triangles, mesh.triangle_uv)
+        orient(sheet, file=file, key="seams")
+        assert sheet.uv is not None
+        mesh = replace(mesh, triangles=sheet.triangles, triangle_uv=sheet.uv)
+        mesh.notes += sheet.notes
+    mesh.coincident, mesh.unconnected = _coincident(mesh)
+    mesh.notes += [mesh.unconnected] * (mesh.unconnected != "")
     return mesh
 
 
@@ -449,12 +469,13 @@ def _scale_notes(uv: Array, corners: Array) -> list[str]:
 
 
 def _coincident(mesh: Mesh) -> tuple[Ints, str]:
-    """`Mesh.coincident` and `Mesh.unconnected`."""
+    """`Mesh.coincident` and `Mesh.unconnected`; seams connect vertices."""
     x = mesh.positions
     corners = x[mesh.triangles]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
     same = coincident_with(x, SAME_PLACE * edge)
-    others = np.flatnonzero(same != np.arange(len(x)))
+    sewn = connected_components(len(x), mesh.tied[np.diff(same[mesh.tied], axis=1)[:, 0] == 0])
+    others = np.flatnonzero((same != np.arange(len(x))) & (sewn != sewn[same]))
     pairs = np.column_stack([others, same[others]])
     if not len(pairs):
         return pairs, ""

@@ -18,6 +18,9 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.partitioner import locality_order, partition, vertex_graph
 from lyra_petsc.mesh.points import Layout, Numbering, Unknowns
 
+TIED = "tied vertices"
+"""Name of the elements (n, 2) of vertices that are held together without being one, as by seams."""
+
 
 @dataclass
 class GlobalMesh:
@@ -170,7 +173,10 @@ def split_elements(owner: Ints, n_ranks: int) -> list[tuple[Ints, int]]:
 def distribute(comm: MPI.Comm, whole: GlobalMesh | None) -> LocalMesh:
     """Partition the mesh and send each rank its part; collective. ``whole`` is needed on rank 0 only."""
     n_vertices = comm.bcast(whole.n_vertices if whole else 0, root=0)
-    graph = vertex_graph([whole.triangles], n_vertices) if whole else None
+    graph = None
+    if whole:
+        ties = [elements.stencil for name, elements in whole.elements.items() if name == TIED]
+        graph = vertex_graph([whole.triangles, *ties], n_vertices)
     if comm.bcast(whole is not None and whole.owner is not None):
         owner, name = (whole.owner if whole else None), "given"
     else:

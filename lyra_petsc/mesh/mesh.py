@@ -82,6 +82,8 @@ class Mesh:
     coincident : (n, 2) int64
         Vertices of one source that coincide at the start without being connected: each with the lowest one
         there.
+    tied : (n, 2) int64
+        Pairs of vertices that seams hold together although they are not one: they may coincide.
     unconnected : str
         Text for the user on these and those of different sources; empty if there are none.
     """
@@ -98,6 +100,7 @@ class Mesh:
     tags: Ints | None = None
     obstacles: dict[str, TriangleSurface] = field(default_factory=dict)
     coincident: Ints = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
+    tied: Ints = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
     unconnected: str = ""
 
     @property

@@ -31,6 +31,7 @@ def used_groups(scene: Scene) -> set[str]:
     ends = [end for attachment in scene.attachments for end in (attachment.start, attachment.to)]
     selectors = [*scene.handles, *scene.loads, *scene.probes.values(), *ends]
     names = {block.group for block in scene.material} | {selector.group for selector in selectors}
+    names |= {name for seam in scene.seams for name in seam.between}
     return {name for name in names if name is not None}
 
 

@@ -35,6 +35,7 @@ from lyra_petsc.scene.frames_key import FramesPath
 from lyra_petsc.scene.gas_block import Gas, Liquid
 from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.petsc_block import PetscValue, petsc_options
+from lyra_petsc.scene.seam_block import Seam
 from lyra_petsc.scene.time_curve import NumberInTime, VectorInTime, VectorPoints, plain_values
 from lyra_petsc.scene.values import (
     AXES,
@@ -905,6 +906,8 @@ class Scene(Block):
         One line for summaries and pages.
     mesh : list of MeshSource
         Source of a sheet, or a list of sources; their vertices are numbered consecutively.
+    seams : list of Seam
+        Pairs of groups of boundary edges that are sewn together.
     material : list of Material
         One material, or a list. At most one has no group; it applies to the triangles in no other's group.
     gravity : (3,) or curve [m/s²] or None
@@ -943,8 +946,14 @@ class Scene(Block):
         PETSc options without the leading dash; an empty value is an option without value.
     """
 
+    unsupported: ClassVar[dict[str, str]] = dict.fromkeys(
+        ("stitches", "stitch", "sewing", "sew"),
+        "edges are sewn by seams: [{between: [front/side, back/side], close: {from: 0, until: 1}}]",
+    )
+
     title: Text = ""
     mesh: Annotated[list[MeshSource], BeforeValidator(_one_or_many)]
+    seams: Annotated[list[Seam], list_of()] = Field(default_factory=list)
     material: Annotated[list[Material], BeforeValidator(_one_or_many)]
     gravity: VectorInTime | None = None
     wind: UniformWind | None = None

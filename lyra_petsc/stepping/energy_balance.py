@@ -207,6 +207,7 @@ class EnergyBalance:
                 ],
                 self._moving_targets(),
             )
+        self._stiff = self._moving_targets(stiff=True)
         self.budget = Budget()
         self.measure()
 
@@ -241,7 +242,7 @@ class EnergyBalance:
                 energy = float(term.energies(here.x, frozen).sum())
                 energy -= term.heat(here.x, frozen) if isinstance(term, Dissipates) else 0.0
                 energies[name] += energy
-                moving += energy if isinstance(term, MovingTargets) else 0.0
+                moving += energy if isinstance(term, MovingTargets) and not term.is_stiff else 0.0
         for load in equations.active.loads:
             if name := load.registration.energy:
                 energies[name] += load.potential(equations.x)
@@ -256,6 +257,7 @@ class EnergyBalance:
     def enter(self, account: StepAccount) -> None:
         """Take the account of a step that is accepted into the books."""
         self.budget, self._moving_energy = account.after, account.moving
+        self._stiff = self._moving_targets(stiff=True)
 
     def record(self, x_before: Array) -> None:
         """`enter` the account of the step just taken from x_before (n_owned, 3)."""
@@ -277,7 +279,11 @@ class EnergyBalance:
                 for (at0, pull0), (at, pull) in zip(targets, self._ends[1], strict=True)
             )
         early = _early_work(equations) if self._ends is None else 0.0
+        at_stage = self._moving_targets(equations.evaluated.x, stiff=True)
         by_targets += _move_targets_to_end(equations)
+        if self._ends is None:
+            moved = zip(self._stiff, at_stage, self._moving_targets(stiff=True), strict=True)
+            by_targets += sum(float(np.vdot(pull, at - at0)) for (at0, _), (_, pull), (at, _) in moved)
         work = _work_of(external, x_before, equations.x) + by_targets
         work += _work_besides_stage(equations, x_before)
         del external  # to save memory
@@ -303,10 +309,14 @@ class EnergyBalance:
         )
         return self.account
 
-    def _moving_targets(self) -> list[tuple[Array, Array]]:
-        """Positions of the targets that move with handles, and the forces on them, by term."""
-        active, x = self._equations.active, self._equations.x
-        return [term.targets(x, self._equations.step.frozen[term]) for term in active.targets]
+    def _moving_targets(self, x: Array | None = None, *, stiff: bool = False) -> list[tuple[Array, Array]]:
+        """The moving targets, and the forces on them, by term, at positions x (n_local, 3) or those of the
+        state; of ``stiff`` terms alone, or of all.
+        """
+        terms, x = self._equations.active.targets, self._equations.x if x is None else x
+        return [
+            term.targets(x, self._equations.step.frozen[term]) for term in terms if term.is_stiff >= stiff
+        ]
 
     def _external_forces(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
         """From the parts of the residual F: forces (n_owned, 3) [N] of handles, springs, friction and loads
@@ -339,6 +349,7 @@ class EnergyBalance:
     def restore(self, arrays: Mapping[str, Array], budget: Mapping[str, Any]) -> None:
         """Restore works from a checkpoint; energies are measured at the present state."""
         self.budget = Budget(**{**budget, "more": {}})
+        self._stiff = self._moving_targets(stiff=True)
         if self._ends is not None:
             self._ends = arrays["pull"], self._moving_targets()
         self.measure()

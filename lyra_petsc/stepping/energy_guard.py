@@ -48,6 +48,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import EnergyBalance, varying_force
 from lyra_petsc.stepping.newton.force_scales import ROUNDOFF
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms.protocols import MovingTargets
 from lyra_petsc.terms.term import Elastic
 
 LARGEST_GAIN = 0.01
@@ -220,6 +221,10 @@ class EndForces:
         sliding, obstacles = equations.active.sliding, equations.active.obstacles
         for term in self._targets:
             if term in obstacles:
+                continue
+            if isinstance(term, MovingTargets) and term.is_stiff:
+                (at0, pull0), (at1, pull1) = (term.targets(end.x, end.frozen[term]) for end in ends)
+                work += 0.5 * float(np.vdot(pull0 + pull1, at1 - at0))
                 continue
             # by positions at both ends, and targets at both
             table = [[float(term.energies(end.x, at.frozen[term]).sum()) for at in ends] for end in ends]

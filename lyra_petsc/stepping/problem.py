@@ -19,7 +19,7 @@ from lyra_petsc.linear.hierarchy import Surface
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.linear.petsc_options import petsc_number
 from lyra_petsc.mesh.build import build_scene_mesh
-from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute
+from lyra_petsc.mesh.distribute import TIED, GlobalMesh, LocalMesh, distribute
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import SAME_PLACE, largest_changes, mean_edge_length, unit_normals
 from lyra_petsc.mesh.mesh import Mesh, Source
@@ -205,6 +205,7 @@ def event_times(scene: Scene) -> list[float]:
             kinks = handle_frames(handle).kinks(scene.time.end, step)
             jumps += [t for t in kinks if window.start < t < window.until]
     windows += [Window(load.start, load.until) for load in scene.loads]
+    windows += [Window(seam.close.start, seam.close.until) for seam in scene.seams if seam.close]
     return [*(t for window in windows for t in window.events()), *jumps]
 
 
@@ -232,6 +233,8 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
         names.append(entry.name)
         if of_term is not None:
             elements[entry.name] = of_term
+    if len(mesh.tied):
+        elements[TIED] = Elements(mesh.tied)
     spacing = mean_edge_length(mesh)
     largest = float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max()))
     check_resolved(spacing, largest, scene)
@@ -408,15 +411,22 @@ def _barrier(rest: RestShape) -> Barrier | None:
 
 
 def _set_up_contact(
-    scene: Scene, whole: WholeProblem, terms: Mapping[str, Term], layout: Layout, mesh: Mesh | None
+    scene: Scene, whole: WholeProblem, terms: Mapping[str, Term], part: LocalMesh, mesh: Mesh | None
 ) -> None:
-    """Pass the obstacles to the contact and friction terms; collective."""
+    """Pass the obstacles, and what seams hold together, to the contact and friction terms; collective."""
     if whole.barrier is None:
         return
     from lyra_petsc.contact.scene_contact import set_up_terms
     from lyra_petsc.mesh.obstacles import build_scene_obstacles
 
-    set_up_terms(terms, whole.barrier, build_scene_obstacles(layout.comm, scene, mesh, Motion), scene)
+    layout, tied = part.layout, part.elements.get(TIED)
+    pairs = [np.empty((0, 2), dtype=np.int64)]
+    if scene.seams:
+        pairs += layout.comm.allgather(
+            layout.global_number[tied.stencil[: tied.n_owned]] if tied is not None else pairs[0]
+        )
+    obstacles = build_scene_obstacles(layout.comm, scene, mesh, Motion)
+    set_up_terms(terms, whole.barrier, obstacles, np.concatenate(pairs), scene)
 
 
 def _scene_contact(
@@ -434,7 +444,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     layout = part.layout
     on_vertices = part.vertex_data["mass"]
     terms = {n: make_term(registration_of(n), part.elements.get(n), scene, on_vertices) for n in whole.terms}
-    _set_up_contact(scene, whole, terms, layout, mesh)
+    _set_up_contact(scene, whole, terms, part, mesh)
     for term in terms.values():
         if isinstance(term, SumsOverRanks):
             term.set_communication(lambda values: layout.global_sum(*values))

@@ -181,6 +181,7 @@ REGISTRY: list[Registration] = [
         Role.ELASTIC,
         MEMBRANE,
     ),
+    Registration("seam", lambda scene, shells: bool(scene.seams), Role.ELASTIC, "seam_energy"),
     Registration(
         "contact",
         lambda scene, shells: scene.contact is not None,

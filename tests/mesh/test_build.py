@@ -40,8 +40,8 @@ def test_several_sheets_are_numbered_consecutively() -> None:
     assert mesh.groups["upper"].triangles.tolist() == [2, 3, 4, 5]
     assert mesh.groups["lower"].vertices.tolist() == [0, 1, 2, 3]
     assert mesh.groups["left"].vertices.tolist() == [0, 2, 4, 7]
-    assert mesh.groups["upper.left"].vertices.tolist() == [4, 7]
-    assert mesh.groups["upper.left"].edges.tolist() == [[4, 7]]
+    assert mesh.groups["upper/left"].vertices.tolist() == [4, 7]
+    assert mesh.groups["upper/left"].edges.tolist() == [[4, 7]]
     assert (mesh.positions[4:, 2] == 1).all()
     assert (mesh.rest[4:, 2] == 0).all()
 

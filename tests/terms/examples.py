@@ -31,6 +31,17 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
     },
     "stretch_limit": {"material": BENDING | {"stretch_limit": 1.8}},
     "shear_friction": {"material": BENDING | {"friction_force": 2.0}},
+    "seam": {
+        "mesh": [
+            {"grid": {"width": 1.0, "height": 0.7, "nx": 2, "ny": 3}, "name": "front"},
+            {
+                "grid": {"width": 0.7, "height": 0.9, "nx": 2, "ny": 2},
+                "name": "back",
+                "transform": {"translate": [1.2, 0.1, 0.2]},
+            },
+        ],
+        "seams": [{"between": ["front/right", "back/left"], "close": {"from": 1.0, "until": 2.0}}],
+    },
     "clamp": {"handles": [{"nodes": [0, 1, 2, 3], "clamp": True}]},
     "attachments": {
         "attachments": [

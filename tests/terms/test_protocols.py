@@ -21,7 +21,7 @@ from mpi4py import MPI
 from oracle import differences, frozen_by, gradient
 from physics import CLOTH, finished, grid, scene_of, shape, stepped
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.scene.schema import INTEGRATORS, Scene
@@ -231,10 +231,6 @@ class Idle(Elastic):
 
 class IdleTargets(Idle, MovingTargets):
     """The same with targets that stay."""
-
-    @property
-    def reference_rows(self) -> Ints:
-        return np.empty(0, dtype=np.int64)
 
     def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:
         self.calls.add("targets")

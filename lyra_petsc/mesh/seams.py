@@ -1,0 +1,335 @@
+"""Seams on rank 0: which vertices are sewn to which, by arc length; and the joining of those that coincide.
+
+Each vertex of the side with more vertices is tied to a point on an edge of the other side, at the same part
+of the rest length. Were the vertices of both sides tied, two sides of different vertices could only be
+straight and evenly stretched: between common points both are linear, so each tie would remove a kink of one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.measures import SAME_PLACE, mean_edge_length
+from lyra_petsc.mesh.mesh import Group, Mesh, Source
+from lyra_petsc.mesh.readers import first_few
+from lyra_petsc.mesh.select import DIMENSION_NAMES, find_group
+from lyra_petsc.mesh.topology import connected_components, edge_table, side_vertices
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.seam_block import Seam
+
+AT_VERTEX = 1e-4
+"""Part of an edge within which a tie belongs to the edge's end: the distance that a rigid seam leaves."""
+
+
+class Curve(NamedTuple):
+    """One side of a seam.
+
+    Attributes
+    ----------
+    vertices : (n,) int64
+        In order; of a closed curve the first one again at the end.
+    place : (n,) float64
+        Arc length from the first vertex in the rest shape [m].
+    """
+
+    vertices: Ints
+    place: Array
+
+    @property
+    def closed(self) -> bool:
+        return bool(self.vertices[0] == self.vertices[-1])
+
+    @property
+    def length(self) -> float:
+        """Rest length [m]."""
+        return float(self.place[-1])
+
+    @property
+    def own(self) -> int:
+        """Number of vertices, each counted once."""
+        return len(self.vertices) - self.closed
+
+    def reversed(self) -> Curve:
+        """The same from its other end."""
+        return Curve(self.vertices[::-1].copy(), self.length - self.place[::-1])
+
+    def shares(self) -> Array:
+        """Arc length [m] that belongs to each vertex, (own,)."""
+        half = 0.5 * np.diff(self.place)
+        out = np.zeros(len(self.vertices))
+        out[:-1] += half
+        out[1:] += half
+        if self.closed:
+            out[0] += out[-1]
+        return out[: self.own]
+
+
+class Ties(NamedTuple):
+    """Ties of one seam or of several.
+
+    Attributes
+    ----------
+    stencil : (n, 3) int64
+        The tied vertex, and the two vertices of an edge of the other side.
+    weight : (n,) float64
+        Place of the tie on the edge, from 0 at its first vertex to below 1.
+    share : (n,) float64
+        Arc length of the tied vertex [m].
+    """
+
+    stencil: Ints
+    weight: Array
+    share: Array
+
+    def gaps(self, x: Array) -> Array:
+        """Vectors (n, 3) [m] from the places on the edges to the tied vertices at positions x (V, 3)."""
+        vertex, first, second = x[self.stencil].transpose(1, 0, 2)
+        w = self.weight[:, None]
+        return np.asarray(vertex - (1.0 - w) * first - w * second)
+
+    def pairs(self) -> Ints:
+        """Pairs of vertices (m, 2) that the ties hold together."""
+        at = self.stencil
+        return np.concatenate([at[:, :2], at[self.weight > 0.0][:, ::2]])
+
+
+class SewnCurves(NamedTuple):
+    """The two sides of a seam.
+
+    Attributes
+    ----------
+    sides : two Curve
+        As the scene names them, in the direction in which they are sewn.
+    tied : int
+        The side, 0 or 1, of which each vertex is tied to an edge of the other one.
+    ties : Ties
+        Without vertices that both sides have in common.
+    """
+
+    sides: tuple[Curve, Curve]
+    tied: int
+    ties: Ties
+
+
+def sewn_curves(scene: Scene, mesh: Mesh) -> list[SewnCurves]:
+    """The curves of all seams of a scene, before or after `join_seams`.
+
+    Raises
+    ------
+    InputError
+        A group is unknown, or no curve; one curve is closed and the other is not, or ``start`` is missing.
+    """
+    edges = _Edges(mesh)
+    return [_sewn(mesh, edges, seam, f"seams[{n}]", scene.source) for n, seam in enumerate(scene.seams)]
+
+
+def _sewn(mesh: Mesh, edges: _Edges, seam: Seam, key: str, file: object | None) -> SewnCurves:
+    one, other = (_curve(mesh, edges, name, f"{key}.between", file) for name in seam.between)
+    if one.closed != other.closed:
+        names = seam.between if one.closed else seam.between[::-1]
+        message = f"'{names[0]}' is a closed curve and '{names[1]}' is not; sew curves of one kind"
+        raise InputError(message, key=f"{key}.between", file=file)
+    if one.closed:
+        if seam.start is None:
+            message = "closed curves need start: [x, y, z], the point where both begin"
+            raise InputError(message, key=key, file=file)
+        one, other = (_begun_at(mesh, curve, np.array(seam.start)) for curve in (one, other))
+    elif seam.start is not None:
+        raise InputError("is for closed curves; these have ends", key=f"{key}.start", file=file)
+    tied = 0 if one.own > other.own else 1
+    fine, coarse = (one, other) if tied == 0 else (other, one)
+    turned = fine.reversed()
+    trials = [(way, _tie(way, coarse)) for way in (fine, turned)]
+    distance = [float(np.linalg.norm(ties.gaps(mesh.positions), axis=1) @ ties.share) for _, ties in trials]
+    backwards = distance[1] < (1.0 - SAME_PLACE) * distance[0]
+    fine, ties = trials[int(backwards != seam.reverse)]
+    at = ties.stencil
+    own = (at[:, 0] == at[:, 1]) & (ties.weight == 0.0)
+    ties = Ties(*(values[~own] for values in ties))
+    if len(wrong := np.flatnonzero((ties.stencil[:, :1] == ties.stencil[:, 1:]).any(axis=1))):
+        message = f"vertex {ties.stencil[wrong[0], 0]} would be sewn to an edge of its own"
+        raise InputError(message, key=f"{key}.between", file=file)
+    return SewnCurves((fine, coarse) if tied == 0 else (coarse, fine), tied, ties)
+
+
+def _tie(fine: Curve, coarse: Curve) -> Ties:
+    """Ties of all vertices of a curve to edges of another one."""
+    place = fine.place[: fine.own] / fine.length * coarse.length
+    edge = np.clip(np.searchsorted(coarse.place, place, side="right") - 1, 0, len(coarse.place) - 2)
+    weight = (place - coarse.place[edge]) / np.diff(coarse.place)[edge]
+    first, second = coarse.vertices[edge], coarse.vertices[edge + 1]
+    at_end = weight > 1.0 - AT_VERTEX
+    first, second = np.where(at_end, second, first), np.where(at_end, first, second)
+    weight = np.where(at_end | (weight < AT_VERTEX), 0.0, weight)
+    return Ties(np.stack([fine.vertices[: fine.own], first, second], axis=1), weight, fine.shares())
+
+
+def _begun_at(mesh: Mesh, curve: Curve, point: Array) -> Curve:
+    """A closed curve that begins at the vertex nearest to the point (3,) [m]."""
+    n = curve.own
+    at = int(np.linalg.norm(mesh.positions[curve.vertices[:n]] - point, axis=1).argmin())
+    steps = np.roll(np.diff(curve.place), -at)
+    vertices = np.roll(curve.vertices[:n], -at)
+    return Curve(np.append(vertices, vertices[0]), np.concatenate([[0.0], np.cumsum(steps)]))
+
+
+class _Edges:
+    """Rest lengths of the mesh's edges, and numbers of their triangles, by their vertices."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        table, uv = edge_table(mesh.triangles), mesh.triangle_uv
+        first = table.sides[table.first]
+        ends = np.sort(side_vertices(mesh.triangles, first)[:, :2], axis=1)
+        length = np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2).ravel()
+        self._n, self._length, self._count = mesh.n_vertices, length[first], table.sizes
+        self._key = ends[:, 0] * self._n + ends[:, 1]  # ascending
+
+    def of(self, edges: Ints) -> tuple[Array, Ints]:
+        """Lengths [m] and numbers of triangles, 0 where there is no such edge, of edges (k, 2)."""
+        low, high = np.sort(edges, axis=1).T
+        key = low * self._n + high
+        at = np.minimum(np.searchsorted(self._key, key), len(self._key) - 1)
+        known = self._key[at] == key
+        return np.where(known, self._length[at], 0.0), np.where(known, self._count[at], 0)
+
+
+def _curve(mesh: Mesh, edges: _Edges, name: str, key: str, file: object | None) -> Curve:
+    """The edges of a group as one curve."""
+
+    def refuse(message: str) -> InputError:
+        return InputError(f"group '{name}' {message}", key=key, file=file)
+
+    group = find_group(mesh, name, key=key, file=file)
+    if not len(group.edges):
+        curves = [other for other, candidate in mesh.groups.items() if len(candidate.edges)]
+        kind = DIMENSION_NAMES[group.dimension]
+        listed = f"groups of edges: {first_few(sorted(curves), 20) or 'none'}"
+        raise refuse(f"is a {kind} group without edges; sew groups of boundary edges ({listed})")
+    ends = np.unique(group.edges, return_inverse=True)[1].reshape(-1, 2)
+    degree = np.bincount(ends.ravel())
+    if (degree > 2).any():
+        raise refuse(f"branches at vertex {group.vertices[degree.argmax()]}; sew one curve without branches")
+    pieces = len(np.unique(connected_components(len(degree), ends)))
+    if pieces > 1:
+        hint = "; name the sheet, as in sheet/group" if len(mesh.sources) > 1 and "/" not in name else ""
+        raise refuse(f"is {pieces} curves, not one{hint}")
+    vertices = _walk(group)
+    steps = np.stack([vertices[:-1], vertices[1:]], axis=1)
+    length, count = edges.of(steps)
+    if not count.all():
+        a, b = steps[count.argmin()]
+        raise refuse(f"has the edge {a}-{b}, which is none of a triangle")
+    return Curve(vertices, np.concatenate([[0.0], np.cumsum(length)]))
+
+
+def _walk(group: Group) -> Ints:
+    """Vertices of a curve in order, from its end of lower number; of a closed one from the lowest."""
+    around: dict[int, list[int]] = {}
+    for a, b in group.edges.tolist():
+        around.setdefault(a, []).append(b)
+        around.setdefault(b, []).append(a)
+    ends = [vertex for vertex, others in around.items() if len(others) == 1]
+    path = [min(ends or around)]
+    before = -1
+    while len(path) <= len(group.edges):
+        following = [vertex for vertex in around[path[-1]] if vertex != before]
+        before = path[-1]
+        path.append(min(following))
+    return np.array(path, dtype=np.int64)
+
+
+def join_seams(scene: Scene, mesh: Mesh) -> Mesh:
+    """The mesh with vertices joined that rigid seams hold together where they coincide at the start.
+
+    ``tied`` gets the pairs of vertices of the other seams.
+
+    Raises
+    ------
+    InputError
+        As `sewn_curves`; or edges that are not at a boundary, or in both groups; or triangles that would
+        lose a side.
+    """
+    same: Ints = np.arange(mesh.n_vertices)
+    edge, edges = mean_edge_length(mesh), _Edges(mesh)
+    taken: dict[tuple[int, int], int] = {}
+    for number, (seam, sewn) in enumerate(zip(scene.seams, sewn_curves(scene, mesh), strict=True)):
+        key = f"seams[{number}].between"
+        for curve in sewn.sides:
+            _check_boundary(curve, edges, number, taken, key, scene.source)
+        one, other = sewn.sides
+        if seam.rigid and one.own == other.own:
+            pairs = np.stack([one.vertices, other.vertices])
+            apart = np.linalg.norm(np.subtract(*mesh.positions[pairs]), axis=1)
+            if apart.max() <= SAME_PLACE * edge:
+                same = connected_components(len(same), np.concatenate([_links(same), pairs.T]))
+                mesh.notes.append(f"seam {seam.label}: {one.own} pairs of vertices joined")
+    if (same != np.arange(len(same))).any():
+        mesh = _joined(mesh, same, scene)
+    mesh.tied = tied_pairs(scene, mesh)
+    return mesh
+
+
+def tied_pairs(scene: Scene, mesh: Mesh) -> Ints:
+    """Pairs of vertices (n, 2) that the seams of a scene hold together, of the mesh from `join_seams`."""
+    return np.concatenate([sewn.ties.pairs() for sewn in sewn_curves(scene, mesh)])
+
+
+def _links(same: Ints) -> Ints:
+    """Pairs (m, 2) of vertices that are joined, ``same`` (V,) being the lowest one of each."""
+    others = np.flatnonzero(same != np.arange(len(same)))
+    return np.column_stack([others, same[others]])
+
+
+def _check_boundary(
+    curve: Curve, edges: _Edges, number: int, taken: dict[tuple[int, int], int], key: str, file: object | None
+) -> None:
+    """Refuse edges of more than one triangle, and those that are sewn already; ``taken`` gets the edges."""
+    steps = np.sort(np.stack([curve.vertices[:-1], curve.vertices[1:]], axis=1), axis=1)
+    _, count = edges.of(steps)
+    for (a, b), triangles in zip(steps.tolist(), count.tolist(), strict=True):
+        if triangles > 1:
+            raise InputError(f"edge {a}-{b} is inside the sheet; sew boundary edges", key=key, file=file)
+        if (a, b) in taken:
+            where = "to itself" if taken[a, b] == number else f"by seams[{taken[a, b]}] already"
+            raise InputError(f"edge {a}-{b} is sewn {where}", key=key, file=file)
+        taken[a, b] = number
+
+
+def _joined(mesh: Mesh, same: Ints, scene: Scene) -> Mesh:
+    """The mesh with vertices joined to the lowest one of each, ``same`` (V,)."""
+    kept = np.flatnonzero(same == np.arange(len(same)))
+    number = np.full(len(same), -1, dtype=np.int64)
+    number[kept] = np.arange(len(kept))
+    number = number[same]
+    triangles = number[mesh.triangles]
+    if (bad := np.flatnonzero((triangles == np.roll(triangles, 1, axis=1)).any(axis=1))).size:
+        message = f"seams join vertices of one triangle: {first_few(bad.tolist())} (counted from 0)"
+        raise InputError(message, key="seams", file=scene.source)
+    owner = np.repeat(np.arange(len(mesh.sources)), [source.n_vertices for source in mesh.sources])
+    counts = np.bincount(owner[kept], minlength=len(mesh.sources))
+    sources = [
+        Source(source.label, int(count), source.n_triangles)
+        for source, count in zip(mesh.sources, counts, strict=True)
+    ]
+
+    def joined(group: Group) -> Group:
+        edges = np.unique(np.sort(number[group.edges], axis=1), axis=0) if len(group.edges) else group.edges
+        return Group(group.dimension, np.unique(number[group.vertices]), group.triangles, edges)
+
+    # the shape at the start is the same as that at rest, but for a rigid motion of each sheet
+    return Mesh(
+        mesh.positions[kept],
+        mesh.positions[kept].copy(),
+        triangles,
+        mesh.triangle_uv,
+        mesh.flat_rest,
+        groups={name: joined(group) for name, group in mesh.groups.items()},
+        notes=mesh.notes,
+        has_uv=mesh.has_uv,
+        sources=sources,
+        tags=None if mesh.tags is None else mesh.tags[kept],
+    )

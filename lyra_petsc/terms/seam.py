@@ -1,0 +1,171 @@
+"""Seams: threads between each vertex of one side and its place on an edge of the other side.
+
+    energy = ½ k s max(0, |d| − L(t))²,   d = x_i − (1 − w) x_j − w x_k
+
+with the vertex's arc length s [m] and the seam's stiffness k [N/m²]. The length L goes from the distance at
+the start to zero while the seam closes. Threads pull and never push, so the energy is a convex, increasing
+function of |d|, hence convex: its exact Hessian is positive semidefinite. Closed seams have a quadratic one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.seams import Ties, sewn_curves
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.seam_block import Seam
+from lyra_petsc.terms.protocols import MovingTargets
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import UpcomingStep
+
+RIGID = 1000.0
+"""Stiffness of rigid seams times the edge length, over the membrane stiffness: the gap over the edge length
+is the strain across the seam, in the sheet beside it, over this number."""
+
+
+class ThreadLengths(NamedTuple):
+    """Lengths of the threads in one step.
+
+    Attributes
+    ----------
+    length : (E,)
+        [m].
+    """
+
+    length: Array
+
+
+def closed_part(seam: Seam, time: float) -> float:
+    """How far a seam is closed at a time [s], from 0 to 1, without a jump of the speed."""
+    if seam.close is None:
+        return 1.0
+    s = min(max((time - seam.close.start) / (seam.close.until - seam.close.start), 0.0), 1.0)
+    return s * s * (3.0 - 2.0 * s)
+
+
+class SeamThreads(MovingTargets):
+    """The threads of all seams.
+
+    Parameters
+    ----------
+    elements : Elements
+        Stencil (E, 3) as of `Ties`; data ``weight`` (E,), ``k`` (E,) [N/m], ``gap`` (E,) distance at the
+        start [m], ``seam`` (E,) number of the seam, ``sign`` (E,) −1 where its first side is the tied one.
+    seams : list of Seam
+        Of the scene.
+    """
+
+    is_stiff = True
+
+    def __init__(self, elements: Elements, seams: list[Seam]) -> None:
+        super().__init__(elements)
+        data = elements.data
+        self._k, self._gap, self._seam = data["k"], data["gap"], data["seam"].astype(np.int64)
+        self._factors = np.stack(
+            [np.ones_like(data["weight"]), data["weight"] - 1.0, -data["weight"]], axis=1
+        )
+        self._seams = seams
+
+    def freeze(self, step: UpcomingStep) -> ThreadLengths:
+        open_part = np.array([1.0 - closed_part(seam, step.target_time) for seam in self._seams])
+        return ThreadLengths(open_part[self._seam] * self._gap)
+
+    def _gaps(self, x: Array) -> Array:
+        """d (E, 3) [m]."""
+        return np.einsum("en,eni->ei", self._factors, x[self.stencil])
+
+    def _pulls(self, d: Array, frozen: ThreadLengths) -> tuple[Array, Array]:
+        """Tensions (E,) [N], and directions (E, 3) of d."""
+        distance = np.linalg.norm(d, axis=1)
+        direction = np.divide(d, distance[:, None], out=np.zeros_like(d), where=distance[:, None] > 0.0)
+        return self._k * np.maximum(distance - frozen.length, 0.0), direction
+
+    def energies(self, x: Array, frozen: ThreadLengths) -> Array:
+        tension, _ = self._pulls(self._gaps(x), frozen)
+        return (0.5 * tension**2 / self._k)[: self.n_owned]
+
+    def add_gradient(self, x: Array, frozen: ThreadLengths, out: Array) -> None:
+        tension, direction = self._pulls(self._gaps(x), frozen)
+        forces = self._factors[:, :, None] * (tension[:, None] * direction)[:, None, :]
+        np.add.at(out, self.stencil, forces)
+
+    def hessians(
+        self, x: Array, frozen: ThreadLengths, lo: int, hi: int, convexity: float, out: Array
+    ) -> None:
+        # the same for any convexity, as the energy is convex
+        d = self._gaps(x)
+        tension, direction = (values[lo:hi] for values in self._pulls(d, frozen))
+        distance, k, length = np.linalg.norm(d[lo:hi], axis=1), self._k[lo:hi], frozen.length[lo:hi]
+        # of a thread without length the energy is ½ k |d|²
+        across = np.divide(tension, distance, out=np.where(length > 0.0, 0.0, k), where=distance > 0.0)
+        along = np.where(tension > 0.0, k, across) - across
+        block = along[:, None, None] * direction[:, :, None] * direction[:, None, :]
+        block += across[:, None, None] * np.eye(3)
+        factors = self._factors[lo:hi]
+        out[:] = np.einsum("ea,eb,eij->eabij", factors, factors, block)
+
+    def targets(self, x: Array, frozen: ThreadLengths) -> tuple[Array, Array]:
+        tension, _ = self._pulls(self._gaps(x), frozen)
+        return frozen.length[: self.n_owned], -tension[: self.n_owned]
+
+    def force_scale(self, size: float) -> Array:
+        return self._k * size
+
+    def loads(self, x: Array, frozen: ThreadLengths) -> tuple[Array, Array]:
+        """Of each of the scene's seams the largest distance [m] of its sides on this rank, and the force [N]
+        on its first side: three components, and the sums of the magnitudes across the seam and along it.
+        """
+        n, count = self.n_owned, len(self._seams)
+        d = self._gaps(x)
+        tension, direction = self._pulls(d, frozen)
+        edge = x[self.stencil[:n, 2]] - x[self.stencil[:n, 1]]
+        edge /= np.linalg.norm(edge, axis=1)[:, None]
+        # the tied side may be the second one
+        force = self.elements.data["sign"][:n, None] * (tension[:, None] * direction)[:n]
+        along = np.einsum("ei,ei->e", force, edge)
+        across = np.linalg.norm(force - along[:, None] * edge, axis=1)
+        gaps, forces = np.zeros(count), np.zeros((count, 5))
+        np.maximum.at(gaps, self._seam[:n], np.linalg.norm(d[:n], axis=1))
+        np.add.at(forces, self._seam[:n], np.column_stack([force, across, np.abs(along)]))
+        return gaps, forces
+
+
+def stiffness_of(rest: RestShape, seam: Seam, ties: Ties) -> float:
+    """Stiffness [N/m²] of a seam."""
+    if not isinstance(seam.stiffness, str):
+        return seam.stiffness
+    beside = np.isin(rest.mesh.triangles, ties.stencil).sum(axis=1) > 1
+    shells = [rest.shells[number] for number in np.unique(rest.shell_of[beside])]
+    edge = float(np.sqrt(4.0 / np.sqrt(3.0) * rest.area[beside].mean()))
+    return RIGID * max(max(shell.c11, shell.c22) for shell in shells) / edge
+
+
+def elements(rest: RestShape) -> Elements:
+    """The ties of all seams (rank 0)."""
+    stencils: list[Ints] = []
+    data: dict[str, list[Array]] = {name: [] for name in ("weight", "k", "gap", "seam", "sign")}
+    for number, sewn in enumerate(sewn_curves(rest.scene, rest.mesh)):
+        ties = sewn.ties
+        if not len(ties.stencil):
+            continue
+        n = len(ties.stencil)
+        stencils.append(ties.stencil)
+        data["weight"].append(ties.weight)
+        data["k"].append(stiffness_of(rest, rest.scene.seams[number], ties) * ties.share)
+        data["gap"].append(np.linalg.norm(ties.gaps(rest.mesh.positions), axis=1))
+        data["seam"].append(np.full(n, float(number)))
+        data["sign"].append(np.full(n, -1.0 if sewn.tied == 0 else 1.0))
+    none = np.empty(0)
+    return Elements(
+        np.concatenate([np.empty((0, 3), dtype=np.int64), *stencils]),
+        {name: np.concatenate([none, *values]) for name, values in data.items()},
+    )
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> SeamThreads:
+    """The term on one rank."""
+    return SeamThreads(elements, scene.seams)
