@@ -175,7 +175,7 @@ def distribute(comm: MPI.Comm, whole: GlobalMesh | None) -> LocalMesh:
     n_vertices = comm.bcast(whole.n_vertices if whole else 0, root=0)
     graph = None
     if whole:
-        ties = [elements.stencil for name, elements in whole.elements.items() if name == TIED]
+        ties = [part.stencil.astype(np.int64) for name, part in whole.elements.items() if name == TIED]
         graph = vertex_graph([whole.triangles, *ties], n_vertices)
     if comm.bcast(whole is not None and whole.owner is not None):
         owner, name = (whole.owner if whole else None), "given"

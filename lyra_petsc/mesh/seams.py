@@ -25,7 +25,7 @@ AT_VERTEX = 1e-4
 """Part of an edge within which a tie belongs to the edge's end: the distance that a rigid seam leaves."""
 
 
-class Curve(NamedTuple):
+class SeamSide(NamedTuple):
     """One side of a seam.
 
     Attributes
@@ -53,9 +53,9 @@ class Curve(NamedTuple):
         """Number of vertices, each counted once."""
         return len(self.vertices) - self.closed
 
-    def reversed(self) -> Curve:
+    def reversed(self) -> SeamSide:
         """The same from its other end."""
-        return Curve(self.vertices[::-1].copy(), self.length - self.place[::-1])
+        return SeamSide(self.vertices[::-1].copy(), self.length - self.place[::-1])
 
     def shares(self) -> Array:
         """Arc length [m] that belongs to each vertex, (own,)."""
@@ -102,7 +102,7 @@ class SewnCurves(NamedTuple):
 
     Attributes
     ----------
-    sides : two Curve
+    sides : two SeamSide
         As the scene names them, in the direction in which they are sewn.
     tied : int
         The side, 0 or 1, of which each vertex is tied to an edge of the other one.
@@ -110,7 +110,7 @@ class SewnCurves(NamedTuple):
         Without vertices that both sides have in common.
     """
 
-    sides: tuple[Curve, Curve]
+    sides: tuple[SeamSide, SeamSide]
     tied: int
     ties: Ties
 
@@ -156,7 +156,7 @@ def _sewn(mesh: Mesh, edges: _Edges, seam: Seam, key: str, file: object | None) 
     return SewnCurves((fine, coarse) if tied == 0 else (coarse, fine), tied, ties)
 
 
-def _tie(fine: Curve, coarse: Curve) -> Ties:
+def _tie(fine: SeamSide, coarse: SeamSide) -> Ties:
     """Ties of all vertices of a curve to edges of another one."""
     place = fine.place[: fine.own] / fine.length * coarse.length
     edge = np.clip(np.searchsorted(coarse.place, place, side="right") - 1, 0, len(coarse.place) - 2)
@@ -168,13 +168,13 @@ def _tie(fine: Curve, coarse: Curve) -> Ties:
     return Ties(np.stack([fine.vertices[: fine.own], first, second], axis=1), weight, fine.shares())
 
 
-def _begun_at(mesh: Mesh, curve: Curve, point: Array) -> Curve:
+def _begun_at(mesh: Mesh, curve: SeamSide, point: Array) -> SeamSide:
     """A closed curve that begins at the vertex nearest to the point (3,) [m]."""
     n = curve.own
     at = int(np.linalg.norm(mesh.positions[curve.vertices[:n]] - point, axis=1).argmin())
     steps = np.roll(np.diff(curve.place), -at)
     vertices = np.roll(curve.vertices[:n], -at)
-    return Curve(np.append(vertices, vertices[0]), np.concatenate([[0.0], np.cumsum(steps)]))
+    return SeamSide(np.append(vertices, vertices[0]), np.concatenate([[0.0], np.cumsum(steps)]))
 
 
 class _Edges:
@@ -197,7 +197,7 @@ class _Edges:
         return np.where(known, self._length[at], 0.0), np.where(known, self._count[at], 0)
 
 
-def _curve(mesh: Mesh, edges: _Edges, name: str, key: str, file: object | None) -> Curve:
+def _curve(mesh: Mesh, edges: _Edges, name: str, key: str, file: object | None) -> SeamSide:
     """The edges of a group as one curve."""
 
     def refuse(message: str) -> InputError:
@@ -223,7 +223,7 @@ def _curve(mesh: Mesh, edges: _Edges, name: str, key: str, file: object | None) 
     if not count.all():
         a, b = steps[count.argmin()]
         raise refuse(f"has the edge {a}-{b}, which is none of a triangle")
-    return Curve(vertices, np.concatenate([[0.0], np.cumsum(length)]))
+    return SeamSide(vertices, np.concatenate([[0.0], np.cumsum(length)]))
 
 
 def _walk(group: Group) -> Ints:
@@ -285,7 +285,12 @@ def _links(same: Ints) -> Ints:
 
 
 def _check_boundary(
-    curve: Curve, edges: _Edges, number: int, taken: dict[tuple[int, int], int], key: str, file: object | None
+    curve: SeamSide,
+    edges: _Edges,
+    number: int,
+    taken: dict[tuple[int, int], int],
+    key: str,
+    file: object | None,
 ) -> None:
     """Refuse edges of more than one triangle, and those that are sewn already; ``taken`` gets the edges."""
     steps = np.sort(np.stack([curve.vertices[:-1], curve.vertices[1:]], axis=1), axis=1)

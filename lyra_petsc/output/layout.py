@@ -9,13 +9,13 @@ XDMF_FILE, VTKHDF_FILE = "states.xdmf", "states.vtkhdf"
 STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
 CHECKPOINT, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
 HISTORY, PROBES, REACTIONS, OBSTACLES = "history.csv", "probes.csv", "reactions.csv", "obstacles.csv"
-VOLUMES, ATTACHMENTS = "volumes.csv", "attachments.csv"
+VOLUMES, ATTACHMENTS, SEAMS = "volumes.csv", "attachments.csv", "seams.csv"
 SCENE_FILE, SUMMARY_FILE, LOCK_FILE = "scene.yaml", "summary.json", "run.lock"
 FAILURE_DATA, FAILURE_XDMF, FAILURE_TEXT = "failure.h5", "failure.xdmf", "failure.txt"
 
 _NAMES = (
     *(MESH_FILE, CELLS_FILE, XDMF_FILE, VTKHDF_FILE, CHECKPOINT, PREVIOUS),
-    *(HISTORY, PROBES, REACTIONS, OBSTACLES, VOLUMES, ATTACHMENTS, SCENE_FILE, SUMMARY_FILE),
+    *(HISTORY, PROBES, REACTIONS, OBSTACLES, VOLUMES, ATTACHMENTS, SEAMS, SCENE_FILE, SUMMARY_FILE),
     *(FAILURE_DATA, FAILURE_XDMF, FAILURE_TEXT),
 )
 

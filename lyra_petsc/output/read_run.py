@@ -26,6 +26,7 @@ from lyra_petsc.output.layout import (
     PROBES,
     REACTIONS,
     SCENE_FILE,
+    SEAMS,
     SUMMARY_FILE,
     VOLUMES,
 )
@@ -265,6 +266,11 @@ class StoredRun:
     def attachments(self) -> Any:
         """attachments.csv, a row for each attachment and step [N], [m]; empty if the scene has none."""
         return as_frame(self._table(ATTACHMENTS))
+
+    @property
+    def seams(self) -> Any:
+        """seams.csv, a row for each seam that is not joined and step [m], [N]; empty if there is none."""
+        return as_frame(self._table(SEAMS))
 
     @cached_property
     def _history(self) -> Columns:

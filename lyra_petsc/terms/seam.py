@@ -18,7 +18,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.seams import Ties, sewn_curves
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.seam_block import Seam
-from lyra_petsc.terms.protocols import MovingTargets
+from lyra_petsc.terms.protocols import MovingTargets, WritesTable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import UpcomingStep
 
@@ -47,7 +47,7 @@ def closed_part(seam: Seam, time: float) -> float:
     return s * s * (3.0 - 2.0 * s)
 
 
-class SeamThreads(MovingTargets):
+class SeamThreads(MovingTargets, WritesTable):
     """The threads of all seams.
 
     Parameters
@@ -60,6 +60,9 @@ class SeamThreads(MovingTargets):
     """
 
     is_stiff = True
+    table = "seams.csv"
+    table_columns = ("name", "gap", "fx", "fy", "fz", "opening", "shear")
+    table_units = ("", "m", "N", "N", "N", "N", "N")
 
     def __init__(self, elements: Elements, seams: list[Seam]) -> None:
         super().__init__(elements)
@@ -71,8 +74,13 @@ class SeamThreads(MovingTargets):
         self._seams = seams
 
     def freeze(self, step: UpcomingStep) -> ThreadLengths:
-        open_part = np.array([1.0 - closed_part(seam, step.target_time) for seam in self._seams])
-        return ThreadLengths(open_part[self._seam] * self._gap)
+        # with lengths that change evenly in a step, threads have theirs at its end also where the stage of
+        # the integrator is elsewhere
+        dt = step.end - step.start
+        part = (step.target_time - step.start) / dt if dt > 0.0 else 0.0
+        ends = [[1.0 - closed_part(seam, at) for seam in self._seams] for at in (step.start, step.end)]
+        start, end = np.array(ends)[:, self._seam]
+        return ThreadLengths(((1.0 - part) * start + part * end) * self._gap)
 
     def _gaps(self, x: Array) -> Array:
         """d (E, 3) [m]."""
@@ -115,12 +123,11 @@ class SeamThreads(MovingTargets):
     def force_scale(self, size: float) -> Array:
         return self._k * size
 
-    def loads(self, x: Array, frozen: ThreadLengths) -> tuple[Array, Array]:
-        """Of each of the scene's seams the largest distance [m] of its sides on this rank, and the force [N]
-        on its first side: three components, and the sums of the magnitudes across the seam and along it.
+    def thread_forces(self, x: Array, frozen: ThreadLengths) -> Array:
+        """Of each owned thread the number of its seam, the distance [m] of its ends, and the force [N] on the
+        seam's first side: three components, and its magnitudes across the seam and along it, (n_owned, 7).
         """
-        n, count = self.n_owned, len(self._seams)
-        d = self._gaps(x)
+        n, d = self.n_owned, self._gaps(x)
         tension, direction = self._pulls(d, frozen)
         edge = x[self.stencil[:n, 2]] - x[self.stencil[:n, 1]]
         edge /= np.linalg.norm(edge, axis=1)[:, None]
@@ -128,10 +135,20 @@ class SeamThreads(MovingTargets):
         force = self.elements.data["sign"][:n, None] * (tension[:, None] * direction)[:n]
         along = np.einsum("ei,ei->e", force, edge)
         across = np.linalg.norm(force - along[:, None] * edge, axis=1)
-        gaps, forces = np.zeros(count), np.zeros((count, 5))
-        np.maximum.at(gaps, self._seam[:n], np.linalg.norm(d[:n], axis=1))
-        np.add.at(forces, self._seam[:n], np.column_stack([force, across, np.abs(along)]))
-        return gaps, forces
+        distance = np.linalg.norm(d[:n], axis=1)
+        return np.column_stack([self._seam[:n], distance, force, across, np.abs(along)])
+
+    def table_rows(self, x: Array, frozen: ThreadLengths) -> list[tuple[float | str, ...]]:
+        total = int(self.over_ranks(np.array([float(self.n_owned)]))[0])
+        every = np.zeros((total, 7))
+        every[self.elements.index[: self.n_owned]] = self.thread_forces(x, frozen)
+        every = self.over_ranks(every.ravel()).reshape(-1, 7)
+        rows: list[tuple[float | str, ...]] = []
+        for number in np.unique(every[:, 0]).astype(int):  # the vertices of others are joined
+            mine = every[every[:, 0] == number, 1:]
+            sums = map(float, mine[:, 1:].sum(axis=0))
+            rows.append((self._seams[number].label, float(mine[:, 0].max()), *sums))
+        return rows
 
 
 def stiffness_of(rest: RestShape, seam: Seam, ties: Ties) -> float:
@@ -144,6 +161,11 @@ def stiffness_of(rest: RestShape, seam: Seam, ties: Ties) -> float:
     return RIGID * max(max(shell.c11, shell.c22) for shell in shells) / edge
 
 
+def _springs_shut(seam: Seam, gap: Array) -> bool:
+    """Whether a rigid seam with distances (n,) [m] of its sides has no time to close."""
+    return seam.rigid and seam.close is None and bool(gap.max() > 0.0)
+
+
 def elements(rest: RestShape) -> Elements:
     """The ties of all seams (rank 0)."""
     stencils: list[Ints] = []
@@ -152,11 +174,18 @@ def elements(rest: RestShape) -> Elements:
         ties = sewn.ties
         if not len(ties.stencil):
             continue
-        n = len(ties.stencil)
+        n, (one, other) = len(ties.stencil), (curve.length for curve in sewn.sides)
+        gap = np.linalg.norm(ties.gaps(rest.mesh.positions), axis=1)
+        seam = rest.scene.seams[number]
+        rest.notes.append(
+            f"seam {seam.label}: {one:.4g} m and {other:.4g} m long ({100.0 * (other / one - 1.0):+.2g} %), "
+            f"{n} ties, open by up to {gap.max():.3g} m"
+            + (": it closes at once; close: {until: …} gives it time" if _springs_shut(seam, gap) else "")
+        )
         stencils.append(ties.stencil)
         data["weight"].append(ties.weight)
-        data["k"].append(stiffness_of(rest, rest.scene.seams[number], ties) * ties.share)
-        data["gap"].append(np.linalg.norm(ties.gaps(rest.mesh.positions), axis=1))
+        data["k"].append(stiffness_of(rest, seam, ties) * ties.share)
+        data["gap"].append(gap)
         data["seam"].append(np.full(n, float(number)))
         data["sign"].append(np.full(n, -1.0 if sewn.tied == 0 else 1.0))
     none = np.empty(0)
