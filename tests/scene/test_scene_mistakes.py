@@ -62,7 +62,7 @@ CASES = [
     ("mesh: {file: 3}", "mesh.file", "path of a mesh file"),
     ("handles: [{group: [a]}]", "handles[0].group", "must be text"),
     # contact and obstacles
-    ("contact: 3", "contact", "must be a block with keys (gap, thickness, self, friction)"),
+    ("contact: 3", "contact", "must be a block with keys (gap, thickness, self, friction, untangle)"),
     ("contact: {gap: 0}", "contact.gap", "must be > 0, not 0"),
     ("contact: {thickness: -1}", "contact.thickness", "must be >= 0, not -1"),
     ("contact: {self: 1}", "contact.self", "must be true or false, not 1"),
