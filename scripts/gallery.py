@@ -66,6 +66,10 @@ ENTRIES = {
     "twist": Entry(1.6, ("--handles", "--colors", "#2f6f9f,#f3e7d3")),
     "reef-knot": Entry(1.0, speed=0.5),
     "shell": Entry(1.0, ("--handles", "--field", "curvature")),
+    "cushion": Entry(1.0, ("--colors", "#7d3c74,#f0d49a"), speed=0.4),
+    "balloon": Entry(1.0, ("--handles",), speed=0.2),
+    "miura": Entry(0.7, ("--colors", "#eee9dc,#c9a86a"), speed=0.2),
+    "crease": Entry(2.5, ("--field", "plastic_curvature"), speed=0.5),
 }
 
 

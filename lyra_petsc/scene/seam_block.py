@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
@@ -64,15 +64,11 @@ class Seam(Block):
         For closed curves: the vertices nearest to this point at the start are where both curves begin.
     close : Closing or None
         Time in which threads pull the seam together; without it the seam is closed from the beginning. Where
-        the vertices of both sides coincide at the start and the seam is rigid, they become one.
+        the vertices of both sides coincide at the start and the seam is rigid, they become one, and the sheet
+        bends there as elsewhere; threads let it bend freely.
     stiffness : "rigid" or float [N/m²]
         Force per length of the seam and distance of its sides; ``rigid``: 1000 times the membrane stiffness
         over the edge length, so that the sides are less than 1e-4 of an edge apart at strains up to 10 %.
-    angle : "free", "rest" or float [°]
-        Angle across the closed seam, from flat, positive towards the normals' side: none, that of the start
-        shape, or this one.
-    bending : float [N·m] or None
-        Bending stiffness of the seam where it has an angle; by default that of the sheets.
     """
 
     between: Annotated[tuple[Name, Name], BeforeValidator(_two_names)]
@@ -84,12 +80,10 @@ class Seam(Block):
         _word_or_number("rigid"),
         WithJsonSchema({"anyOf": [{"const": "rigid"}, {"type": "number", "exclusiveMinimum": 0}]}),
     ] = "rigid"
-    angle: Annotated[
-        float | Literal["free", "rest"],
-        _word_or_number("free", "rest"),
-        WithJsonSchema({"anyOf": [{"enum": ["free", "rest"]}, {"type": "number"}]}),
-    ] = "free"
-    bending: NonNegative | None = None
+    unsupported: ClassVar[dict[str, str]] = dict.fromkeys(
+        ("angle", "bending"),
+        "is not known: a seam that is pulled together bends freely, one that is joined as the sheet does",
+    )
 
     @property
     def rigid(self) -> bool:
@@ -102,12 +96,7 @@ class Seam(Block):
         return " - ".join(self.between)
 
     def check(self) -> None:
-        """Refuse a group that is sewn to itself, and a stiffness or an angle out of range."""
+        """Refuse a group that is sewn to itself, and a stiffness out of range."""
         require(self.between[0] != self.between[1], "must be two groups, not one and the same", "between")
         if not isinstance(self.stiffness, str):
             require(self.stiffness > 0.0, f"must be > 0, not {self.stiffness:g}", "stiffness")
-        if not isinstance(self.angle, str):
-            require(
-                abs(self.angle) < 180.0, f"must be between -180 and 180 degrees, not {self.angle:g}", "angle"
-            )
-        self.require_with("bending", self.angle != "free", "needs an angle: rest, or degrees")

@@ -44,7 +44,7 @@ def panels(n_front: int, n_back: int, gap: float, seam: dict[str, Any], **more: 
         ({"start": [0, 0, 0]}, "for closed curves"),
         ({"close": {"from": 1, "until": 1}}, "later than from"),
         ({"stiffness": -1}, "> 0"),
-        ({"bending": 1.0}, "needs an angle"),
+        ({"angle": 30}, "bends freely"),
     ],
 )
 def test_what_cannot_be_sewn_is_refused(seam: dict[str, Any], words: str) -> None:
