@@ -178,7 +178,7 @@ def elements(rest: RestShape) -> Elements:
         gap = np.linalg.norm(ties.gaps(rest.mesh.positions), axis=1)
         seam = rest.scene.seams[number]
         rest.notes.append(
-            f"seam {seam.label}: {one:.4g} m and {other:.4g} m long ({100.0 * (other / one - 1.0):+.2g} %), "
+            f"seam {seam.label}: {one:.4g} m and {other:.4g} m long ({100.0 * (other / one - 1.0):+.2f} %), "
             f"{n} ties, open by up to {gap.max():.3g} m"
             + (": it closes at once; close: {until: …} gives it time" if _springs_shut(seam, gap) else "")
         )
