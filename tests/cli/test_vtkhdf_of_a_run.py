@@ -13,7 +13,8 @@ from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.scene.schema import FIELDS
 
 # the model of bending that has every field
-PLAIN = tuple(name for name in FIELDS if name != "contact_pressure")  # for which a scene must name contact
+NAMED = "contact_pressure", "plastic_curvature"  # for which a scene must name contact or yielding
+PLAIN = tuple(name for name in FIELDS if name not in NAMED)
 ON = ["--set", "output.vtkhdf=true", "--set", f"output.fields=[{', '.join(PLAIN)}]"]
 ON += ["--set", "material.bending_model=midedge"]
 
