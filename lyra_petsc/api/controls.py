@@ -6,14 +6,22 @@ keyframes or values of the scene.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
-from lyra_petsc.errors import InputError, suggest
+import numpy as np
+from mpi4py import MPI
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.errors import InputError, python_argument_names, suggest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.driven_curve import DrivenCurve
-from lyra_petsc.scene.schema import Handle, Obstacle, Scene
+from lyra_petsc.scene.messages import validated
+from lyra_petsc.scene.schema import Handle, Keyframe, Obstacle, Scene
 from lyra_petsc.scene.time_curve import TimeCurve
+from lyra_petsc.scene.values import shown
+from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.handles.driven_motion import DrivenMotion
 from lyra_petsc.terms.handles.motion import STILL, Motion, motion_of
 
@@ -82,3 +90,82 @@ def _with(value: Any, path: tuple[Any, ...], driven: Driven) -> Any:
     changed = dict(value) if isinstance(value, dict) else list(value)
     changed[key] = _with(value[key], tuple(rest), driven)
     return changed
+
+
+class Controls:
+    """What a program drives, by name, and the calls that do so.
+
+    Parameters
+    ----------
+    driven : dict of DrivenMotion or DrivenCurve
+        From `drive`.
+    """
+
+    def __init__(self, driven: dict[str, Driven]) -> None:
+        self._driven = driven
+
+    def move(self, run: SteppedScene, name: str, place: Mapping[str, Any], at: float | None) -> None:
+        """Move a handle or obstacle to a place, the keys of a keyframe, until ``at`` [s]; see
+        `Simulation.move`.
+        """
+        motion, time = self._named(name, DrivenMotion, "move"), _time(run, at)
+        keys = {key: value for key, value in place.items() if value is not None}
+        with python_argument_names():
+            target = validated(Keyframe, {"time": time, **keys}, file=None)
+        if motion.go_to(target, run.time):
+            run.expect_jump(run.time)
+        run.follow_driven(time)
+
+    def set(self, run: SteppedScene, name: str, value: Any, at: float | None) -> None:
+        """Change a value until ``at`` [s], or now; see `Simulation.set`."""
+        curve, number = self._named(name, DrivenCurve, "set"), np.asarray(value, dtype=np.float64)
+        if number.shape != curve.values[0].shape or not np.isfinite(number).all():
+            words = "three finite numbers" if curve.values[0].ndim else "a finite number"
+            raise InputError(f"must be {words}, not {shown(value)}", key=name)
+        time = run.time if at is None else _time(run, at)
+        curve.go_to(number, run.time, time)
+        if at is None:
+            run.expect_jump(run.time)
+        else:
+            run.follow_driven(time)
+
+    def _named(self, name: str, kind: type[Any], call: str) -> Any:
+        if name not in self._driven:
+            how = f"is not driven: Simulation(scene, drives=[{name!r}]) lets the program do so"
+            raise InputError(how, key=name)
+        if not isinstance(self._driven[name], kind):
+            other = "move" if call == "set" else "set"
+            raise InputError(f"is changed by {other}(), not {call}()", key=name)
+        return self._driven[name]
+
+    def saved_state(self) -> dict[str, Any]:
+        """How all that is driven goes on, for `restore`."""
+        return {name: function.saved_state() for name, function in self._driven.items()}
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Return to a `saved_state`."""
+        for name, function in self._driven.items():
+            function.restore(saved[name])
+
+
+def _time(run: SteppedScene, at: float | None) -> float:
+    """The time ``at`` [s], or the end of the next step."""
+    if at is None:
+        return run.control.next_end(run.time)
+    if not run.time < at < math.inf:
+        raise InputError(f"must be later than now, {run.time:g} s, not {shown(at)}", key="at")
+    return float(at)
+
+
+def finite_rows(comm: MPI.Comm, name: str, values: Any, count: int) -> Array:
+    """Finite numbers (count, 3) for a rank's vertices; refuses others on all ranks."""
+    rows = np.asarray(values, dtype=np.float64)
+    problem = ""
+    if rows.shape != (count, 3):
+        problem = f"has shape {rows.shape}, not ({count}, 3): a row for each of .vertices"
+    elif not np.isfinite(rows).all():
+        problem = "has numbers that are not finite"
+    for text in comm.allgather(problem):
+        if text:
+            raise InputError(text, key=f"Simulation.{name}")
+    return rows

@@ -13,24 +13,19 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.api.controls import drive
+from lyra_petsc.api.controls import Controls, drive, finite_rows
 from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.arrays import Array, Ints, unwritable
 from lyra_petsc.errors import InputError, python_argument_names, suggest
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.output.checkpoint import Checkpoint
-from lyra_petsc.output.continuation import checkpoint_of, take
+from lyra_petsc.output.continuation import checkpoint_of, refuse_crossing_positions, take
 from lyra_petsc.output.fields import FIELDS, check_field
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.parallel import on_root, restore_signal_handlers
-from lyra_petsc.scene.driven_curve import DrivenCurve
-from lyra_petsc.scene.messages import validated
-from lyra_petsc.scene.schema import Keyframe, Scene
-from lyra_petsc.scene.values import shown
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.outside_changes import ProgramForces, add_forces, set_state
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.handles.driven_motion import DrivenMotion
-from lyra_petsc.terms.handles.motion import Motion
 
 restore_signal_handlers()  # PETSc's import has replaced the signal handlers
 
@@ -161,7 +156,8 @@ class Simulation:
         """The scene at its start; rank 0 may know its mesh and the owners of its vertices."""
         self._forces: ProgramForces | None = None
         with python_argument_names():
-            scene, self._driven = drive(self.scene, self._names)
+            scene, driven = drive(self.scene, self._names)
+        self._controls = Controls(driven)
         with np.errstate(over="ignore", invalid="ignore"):
             return SteppedScene(self.comm, scene, mesh=mesh, owner=owner)
 
@@ -235,10 +231,13 @@ class Simulation:
         self._set_state("velocities", self.positions, values)
 
     def _set_state(self, name: str, positions: Array, velocities: Array) -> None:
-        x, v = self._rows(name, positions), self._rows(name, velocities)
+        x, v = (
+            finite_rows(self.comm, name, values, len(self.vertices)) for values in (positions, velocities)
+        )
         run = self._running
         if self.scene.contact is not None:
-            self._refuse_crossings(x)
+            whole = self.gather(x)
+            on_root(self.comm, lambda: refuse_crossing_positions(run, np.asarray(whole)))
         with np.errstate(over="ignore", invalid="ignore"):
             set_state(run, x, v)
         self._note(name)
@@ -248,21 +247,6 @@ class Simulation:
         text = f"the program has set {name}: the scene alone does not repeat this run"
         self._running.run_notes.once(f"set {name}", text)
 
-    def _refuse_crossings(self, positions: Array) -> None:
-        """Refuse positions (n, 3) at which sheets cross each other or obstacles."""
-        run, whole = self._running, self.gather(positions)
-
-        def refuse() -> None:
-            from lyra_petsc.contact.start_crossings import refuse_crossings  # with kernels
-            from lyra_petsc.mesh.obstacles import build_obstacles
-
-            assert self.mesh is not None
-            assert whole is not None
-            obstacles = build_obstacles(run.scene, self.mesh.obstacles, Motion)
-            refuse_crossings(run.scene, self.mesh, whole, obstacles, run.time, f"at {run.time_text()}")
-
-        on_root(self.comm, refuse)
-
     @property
     def forces(self) -> Array:
         """Forces (n, 3) [N] on this rank's vertices that the program has set, a copy."""
@@ -271,24 +255,11 @@ class Simulation:
     @forces.setter
     def forces(self, values: Array) -> None:
         """Set forces (n, 3) [N] that act on this rank's vertices from now on, besides the scene's loads."""
-        rows = self._rows("forces", values)
+        rows = finite_rows(self.comm, "forces", values, len(self.vertices))
         if self._forces is None:
-            self._forces = add_forces(self._running)
+            self._forces = add_forces(self._running, np.zeros_like(rows))
         self._forces.set(self._running, rows)
         self._note("forces")
-
-    def _rows(self, name: str, values: Any) -> Array:
-        """Finite numbers (n, 3) for this rank's vertices; refuses others on all ranks."""
-        rows = np.asarray(values, dtype=np.float64)
-        problem = ""
-        if rows.shape != (len(self.vertices), 3):
-            problem = f"has shape {rows.shape}, not ({len(self.vertices)}, 3): a row for each of .vertices"
-        elif not np.isfinite(rows).all():
-            problem = "has numbers that are not finite"
-        for text in self.comm.allgather(problem):
-            if text:
-                raise InputError(text, key=f"Simulation.{name}")
-        return rows
 
     # -- what is driven ----------------------------------------------------------------------------
 
@@ -316,14 +287,8 @@ class Simulation:
         ------
         InputError
         """
-        motion, run = self._driven_as(name, DrivenMotion, "move"), self._running
-        time = self._time_of(at)
-        place = {"time": time, "translate": list(translate), "rotate": rotate, "scale": scale}
-        with python_argument_names():
-            target = validated(Keyframe, {k: v for k, v in place.items() if v is not None}, file=None)
-        if motion.go_to(target, run.time):
-            run.expect_jump(run.time)
-        run.follow_driven(time)
+        place = {"translate": list(translate), "rotate": rotate, "scale": scale}
+        self._controls.move(self._running, name, place, at)
         self._note(name)
 
     def set(self, name: str, value: Any, *, at: float | None = None) -> None:
@@ -337,35 +302,8 @@ class Simulation:
         at : float, optional
             When it has this value [s]; by default now.
         """
-        curve, run = self._driven_as(name, DrivenCurve, "set"), self._running
-        number = np.asarray(value, dtype=np.float64)
-        if number.shape != curve.values[0].shape or not np.isfinite(number).all():
-            raise InputError(f"must be {_shape(curve.values[0])}, not {shown(value)}", key=name)
-        time = run.time if at is None else self._time_of(at)
-        curve.go_to(number, run.time, time)
-        if at is None:
-            run.expect_jump(run.time)
-        else:
-            run.follow_driven(time)
+        self._controls.set(self._running, name, value, at)
         self._note(name)
-
-    def _driven_as(self, name: str, kind: type[Any], call: str) -> Any:
-        if name not in self._driven:
-            what = f"is not driven: Simulation(scene, drives=[{name!r}]) lets the program do so"
-            raise InputError(what, key=name)
-        if not isinstance(self._driven[name], kind):
-            other = "move" if call == "set" else "set"
-            raise InputError(f"is changed by {other}(), not {call}()", key=name)
-        return self._driven[name]
-
-    def _time_of(self, at: float | None) -> float:
-        """The time ``at``, or the end of the next step."""
-        run = self._running
-        if at is None:
-            return run.control.next_end(run.time)
-        if not run.time < at < np.inf:
-            raise InputError(f"must be later than now, {run.time:g} s, not {shown(at)}", key="at")
-        return float(at)
 
     @property
     def reactions(self) -> dict[str, Array]:
@@ -377,25 +315,21 @@ class Simulation:
 
     def save(self) -> SavedState:
         """The present state in memory, for `restore`."""
-        held = checkpoint_of(self._running)
-        kept = copy.deepcopy(held)
-        driven = {name: function.saved_state() for name, function in self._driven.items()}
+        kept = copy.deepcopy(checkpoint_of(self._running))
         forces = None if self._forces is None else self._forces.forces.copy()
-        return SavedState(kept, driven, forces, self._running.jumps)
+        return SavedState(kept, self._controls.saved_state(), forces, self._running.jumps)
 
     def restore(self, saved: SavedState) -> None:
         """Return to a state that this simulation has saved; it goes on as it went on from there."""
         self.reset()
         run = self._running
-        for name, function in self._driven.items():
-            function.restore(saved.driven[name])
+        self._controls.restore(saved.driven)
         for time in saved.jumps:
             run.expect_jump(time)
         order = FileOrder(self.comm, self.vertices, run.problem.points.n_vertices_global)
         take(run, saved.checkpoint, order)
         if saved.forces is not None:
-            self._forces = add_forces(run)
-            self._forces.forces = saved.forces.copy()
+            self._forces = add_forces(run, saved.forces)
 
     def reset(self) -> None:
         """Return to the start of the scene, with nothing set by the program."""
@@ -517,8 +451,3 @@ def _handed_out(values: NDArray[Any]) -> Array:
     result: Array = np.array(values)
     unwritable(result)
     return result
-
-
-def _shape(value: Array) -> str:
-    """What a value like this one is, in words."""
-    return "three finite numbers" if value.ndim else "a finite number"

@@ -80,27 +80,18 @@ class ContactBarrier(LimitsStep):
     """
 
     def __init__(self, search: ContactSearch) -> None:
-        self.search, self.static = search, False
+        self.search = search
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32)))
         self._capacity = self._set_number = 0
         self.set_pairs(no_near_pairs(), self.stencil, 0)
 
     def set_up(
-        self,
-        barrier: Barrier,
-        obstacles: Sequence[Solid | Container],
-        joined: JoinedVertices,
-        *,
-        self_contact: bool,
-        static: bool,
+        self, barrier: Barrier, obstacles: Sequence[Solid | Container], joined: JoinedVertices
     ) -> None:
-        """Take the data that are the same on all ranks; must be called first.
-
-        ``self_contact``: sheets repel each other and themselves; ``static``: an equilibrium is computed.
-        """
-        self.barrier, self.static = barrier, static
-        self.search.set_up(barrier, obstacles, joined, self_contact=self_contact, static=static)
+        """Take the data that are the same on all ranks; must be called first."""
+        self.barrier = barrier
+        self.search.set_up(barrier, obstacles, joined)
 
     @property
     def obstacles(self) -> Obstacles:
@@ -356,12 +347,8 @@ class ContactBarrier(LimitsStep):
         """
         to_start, to_end = (self.obstacles.motions(at, time) for time in (start, end))
         work = 0.0
-        for obstacle, force, on_points in self._obstacle_gradients(x, self.obstacles.positions(at)):
-            if obstacle in to_end.deforming:
-                work += float(np.vdot(on_points, to_end.end - to_start.end))
-            else:
-                (r0, t0), (r1, t1) = to_start.rigid[obstacle], to_end.rigid[obstacle]
-                work -= float(np.vdot(force, x @ (r1 - r0).T + t1 - t0))
+        for obstacle, *forces in self._obstacle_gradients(x, self.obstacles.positions(at)):
+            work += to_end.work(obstacle, x, *forces) - to_start.work(obstacle, x, *forces)
         return work
 
     def moved_with_obstacles(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Array:

@@ -70,6 +70,15 @@ class BodyMotions(NamedTuple):
         moved = new[:, 0] + np.einsum("ei,eik->ek", part, sides_after)
         return moved + np.einsum("eij,ej->ei", rotation, above), rotation
 
+    def work(self, obstacle: int, x: Array, force: Array, on_points: Array) -> float:
+        """Work [J] of an obstacle on the sheets in its motion, by constant forces: ``force`` (n, 3) [N] on it
+        at vertices x (n, 3), or, if it deforms, the gradient ``on_points`` (m, 3) [N] by its points.
+        """
+        if obstacle in self.deforming:
+            return float(np.vdot(on_points, self.end - self.start))
+        rotation, translation = self.rigid[obstacle]
+        return -float(np.vdot(force, x @ rotation.T + translation - x))
+
     def moves(self, obstacle: int) -> bool:
         """Whether an obstacle is elsewhere at the end."""
         if obstacle in self.deforming:

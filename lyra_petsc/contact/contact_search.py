@@ -72,22 +72,16 @@ class ContactSearch:
         self._walled = np.empty((0, 0), dtype=np.bool_)  # walls that act on each vertex
 
     def set_up(
-        self,
-        barrier: Barrier,
-        obstacles: Sequence[Solid | Container],
-        joined: JoinedVertices,
-        *,
-        self_contact: bool,
-        static: bool,
+        self, barrier: Barrier, obstacles: Sequence[Solid | Container], joined: JoinedVertices
     ) -> None:
         """Take the data that are the same on all ranks; must be called first."""
         self._joined = joined
         walls = barrier.walls, -0.5 * barrier.thickness  # at half of the distance of a vertex from its image
         self.obstacles, self._gap = Obstacles(obstacles, barrier.flat, *walls), barrier.gap
-        self._self_contact, self._static = self_contact, static
+        self._of_sheets, self._static = barrier.of_sheets, barrier.static
         self.skin = SKIN * barrier.gap
         self.distance = barrier.thickness + barrier.gap + self.skin
-        self.approach_limit = (EDGE_GAP if self_contact else 1.0) * barrier.gap + self.skin
+        self.approach_limit = (EDGE_GAP if barrier.of_sheets else 1.0) * barrier.gap + self.skin
         self._obstacle_search = ObstacleSearch(self.obstacles, self._sheets, self.distance)
         self._next_obstacle_x = self._obstacle_search.x
 
@@ -141,7 +135,7 @@ class ContactSearch:
         parts = [np.empty((0, 7), dtype=np.int64)]
         if self.obstacles.bodies:
             parts += self._obstacle_search.pairs(x, dx, boxes, self._walled)
-        if self._self_contact:
+        if self._of_sheets:
             radius = self.distance
             edge_radius = radius - (1.0 - EDGE_GAP) * self._gap
             pairs = self._sheets.pairs(x, dx, numbers, radius, edge_radius, boxes, limit)

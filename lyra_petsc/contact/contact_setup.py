@@ -58,6 +58,10 @@ class Barrier(NamedTuple):
         Radius [m] of spheres and rods from which on they count as nearly flat (`SAG`).
     walls : tuple of Container
         Symmetry planes, one for each side with sheets.
+    of_sheets : bool
+        Whether sheets repel each other and themselves.
+    static : bool
+        Whether an equilibrium is computed.
     """
 
     gap: float
@@ -66,6 +70,8 @@ class Barrier(NamedTuple):
     parallel: float
     flat: float = np.inf
     walls: tuple[Container, ...] = ()
+    of_sheets: bool = True
+    static: bool = False
 
 
 def surface_elements(rest: RestShape) -> Elements:
@@ -141,7 +147,8 @@ def barrier(rest: RestShape) -> Barrier:
     stiffness *= max(1.0 / HALFWAY_CURVATURE, MIN_STRAIN * float(length.mean()) / gap)
     flat = float(length.max()) ** 2 / (8.0 * SAG * gap)
     walls = tuple(wall.container for wall in symmetry_walls(scene, rest.mesh))
-    return Barrier(gap, thickness, stiffness, NEARLY_PARALLEL, flat, walls)
+    acts = scene.contact.self, scene.time.static
+    return Barrier(gap, thickness, stiffness, NEARLY_PARALLEL, flat, walls, *acts)
 
 
 def _gap_and_narrowing(rest: RestShape) -> tuple[float, Array]:

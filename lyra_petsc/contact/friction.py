@@ -246,7 +246,7 @@ class CoulombFriction(Stateful):
     def add_hessian(self, x: Array, frozen: ObstacleMotion, into: Assembly) -> None:
         data = self._friction(frozen).kernel_data
         # the potential is convex; with a secant for sliding pairs equilibria would converge only linearly
-        convexity = 0.0 if self._contact.static else into.convexity
+        convexity = 0.0 if self._contact.barrier.static else into.convexity
         to = into.offsets[self.name], into.values
         friction_pairs.add_hessians(x, *data, into.weight, convexity, *to)
 

@@ -17,7 +17,6 @@ from lyra_petsc.contact.joined import JoinedVertices
 from lyra_petsc.contact.pair_search import PairSearch
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.step_end import ContactEnd, ContactImpulses, StepEnd
 from lyra_petsc.terms.term import Term
 
@@ -37,15 +36,12 @@ def set_up_terms(
     barrier: Barrier,
     obstacles: Sequence[Solid | Container],
     tied: Ints,
-    scene: Scene,
 ) -> None:
     """Give the terms of a scene with contact the data that are the same on all ranks; ``tied`` (n, 2) are
     the global numbers of vertices that are held together.
     """
-    assert scene.contact is not None
     contact = cast(ContactBarrier, terms["contact"])
-    joined, own = JoinedVertices(tied), scene.contact.self
-    contact.set_up(barrier, obstacles, joined, self_contact=own, static=scene.time.static)
+    contact.set_up(barrier, obstacles, JoinedVertices(tied))
     if "friction" in terms:
         cast(CoulombFriction, terms["friction"]).set_up(contact)
 

@@ -112,16 +112,26 @@ def take(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrder) 
 
 def _refuse_crossings(simulation: SteppedScene, checkpoint: Path) -> None:
     """Refuse a scene that is changed so that sheets cross each other or obstacles now (rank 0)."""
-    scene, mesh = simulation.scene, simulation.problem.mesh
-    if scene.contact is None or mesh is None:
+    if simulation.scene.contact is None:
         return
+    with open_stored(checkpoint) as file:
+        refuse_crossing_positions(simulation, file["vertices/position"][()])
+
+
+def refuse_crossing_positions(simulation: SteppedScene, positions: Array) -> None:
+    """Refuse positions (V, 3) [m] at which sheets cross each other or obstacles at the present time (rank 0).
+
+    Raises
+    ------
+    InputError
+    """
     from lyra_petsc.contact.start_crossings import refuse_crossings  # with kernels
     from lyra_petsc.mesh.obstacles import build_obstacles
 
-    with open_stored(checkpoint) as file:
-        positions = file["vertices/position"][()]
-    obstacles = build_obstacles(scene, mesh.obstacles, Motion)
-    refuse_crossings(scene, mesh, positions, obstacles, simulation.time, f"at {simulation.time_text()}")
+    scene, mesh = simulation.scene, simulation.problem.mesh
+    if mesh is not None:
+        obstacles = build_obstacles(scene, mesh.obstacles, Motion)
+        refuse_crossings(scene, mesh, positions, obstacles, simulation.time, f"at {simulation.time_text()}")
 
 
 def first_positions(folder: Path, order: FileOrder, *, otherwise: Array) -> Array:

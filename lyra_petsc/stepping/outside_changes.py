@@ -24,9 +24,9 @@ class ProgramForces(Load):
 
     registration = Registration("program forces", lambda scene, shells: False, Role.LOAD)
 
-    def __init__(self, n_vertices: int) -> None:
+    def __init__(self, forces: Array) -> None:
         super().__init__(Elements(np.empty((0, 1), dtype=np.int32), {}))
-        self.forces = np.zeros((n_vertices, 3))
+        self.forces = forces
 
     def set(self, run: SteppedScene, forces: Array) -> None:
         """Let other forces (n, 3) [N] act from now on."""
@@ -37,9 +37,9 @@ class ProgramForces(Load):
         out[: len(self.forces)] += self.forces
 
 
-def add_forces(run: SteppedScene) -> ProgramForces:
-    """Let forces of the program act, at first zero."""
-    forces = ProgramForces(run.problem.points.n_vertices)
+def add_forces(run: SteppedScene, values: Array) -> ProgramForces:
+    """Let forces (n, 3) [N] of the program act."""
+    forces = ProgramForces(values.copy())
     run.problem.equations.active.add_load(forces)
     return forces
 

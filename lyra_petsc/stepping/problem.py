@@ -426,7 +426,7 @@ def _set_up_contact(
             layout.global_number[tied.stencil[: tied.n_owned]] if tied is not None else pairs[0]
         )
     obstacles = build_scene_obstacles(layout.comm, scene, mesh, Motion)
-    set_up_terms(terms, whole.barrier, obstacles, np.concatenate(pairs), scene)
+    set_up_terms(terms, whole.barrier, obstacles, np.concatenate(pairs))
 
 
 def _scene_contact(

@@ -192,8 +192,7 @@ class StageEquations:
 
     def _freeze(self, at: float, x: Array) -> None:
         """Freeze geometry at positions x (n_local, 3), targets and loads at the time ``at`` [s]."""
-        lagged = self.integrator.lagged_loads
-        there = self.targets_at(at, x)
+        lagged, there = self.integrator.lagged_loads, self.targets_at(at, x)
         frozen = self.active.freeze(there)
         self.directors.begin_step()
         if (geometry := self.state.geometry(frozen)) is None:
