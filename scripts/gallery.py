@@ -112,7 +112,7 @@ def main() -> None:
     for name in asked.names or ENTRIES:
         make(name, ENTRIES[name], asked.runs.absolute(), asked.ranks)
     if not asked.names or GIF in asked.names:
-        look = ("--size", "480x270", "--fps", "20", "--handles")
+        look = ("--size", "420x236", "--fps", "15", "--handles")
         lyra("render", str(asked.runs.absolute() / GIF), "--film", str(GALLERY / f"{GIF}.gif"), *look)
     size = sum(path.stat().st_size for path in GALLERY.iterdir())
     print(f"gallery      {GALLERY}: {size / 1e6:.2f} MB")
