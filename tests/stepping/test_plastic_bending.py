@@ -133,6 +133,60 @@ def test_loop_of_hinges_across_the_strip() -> None:
     assert heats[30] - heats[10] == pytest.approx(turning * (lost[30] - lost[10]), rel=2e-3)
 
 
+def gauged(content: dict[str, Any]) -> tuple[Array, Array, Array]:
+    """Curvature [1/m] of the middle third of a strip of two rows of squares, moment there [N m/m], and heat
+    and stored energy less the work of the handles [J], after each load step.
+    """
+    rows, third = [(0.0, 0.0, 0.0)], (N // 3, 2 * N // 3)
+    with Bench(MPI.COMM_SELF) as bench, bench.simulation(content) as trial:
+        balance, equations = trial.simulation.energy_balance, trial.simulation.problem.equations
+        points = np.round(equations.x[: 3 * (N + 1)] / CELL)
+        rows_of_mesh = np.lexsort(points.T[:2]).reshape(3, N + 1)
+        far = rows_of_mesh[:, -2:].ravel()
+        while not trial.simulation.finished:
+            trial.step()
+            middle = equations.x[rows_of_mesh[1]]
+            slopes = [math.atan2(*(middle[i + 1] - middle[i - 1])[[2, 0]]) for i in third]
+            arms = equations.x[far] - middle[N // 2]
+            moment = -np.cross(arms, balance.reaction[far])[:, 1].sum()
+            budget = balance.budget
+            missing = budget.total + budget.dissipation - budget.external_work
+            curvature = math.remainder(slopes[1] - slopes[0], 2.0 * math.pi) / (CELL * (third[1] - third[0]))
+            rows.append((curvature, moment / (2.0 * CELL), missing))
+    curvatures, moments, missing_energies = np.array(rows).T
+    return curvatures, moments, missing_energies
+
+
+def free_to_twist(path: Array) -> dict[str, Any]:
+    """A strip of squares with diagonals of both directions, where hinges have 0.8 B."""
+    content = loading(SHEET | {"bending_model": "hinge"}, path, 1)
+    return content | {"mesh": grid(LENGTH, 2.0 * CELL, N, 2, "alternating")}
+
+
+def test_loop_of_hinges_with_their_own_stiffness() -> None:
+    # hinges across the strip, which yield at B κ_y, in series with diagonals of 4 B, which do not
+    stiffness, curvature, hardening = 0.8 * B, YIELD / 0.8, 5.0 * HARDENING / (4.0 + HARDENING)
+    curvatures, moments, missing = gauged(free_to_twist(PATH))
+    expected, lost = bilinear(curvatures, stiffness, curvature, hardening)
+    np.testing.assert_allclose(moments, expected, rtol=0.0, atol=5e-3 * expected.max())
+    loop = np.s_[10:31]
+    work = float(np.sum(0.5 * (moments[loop][1:] + moments[loop][:-1]) * np.diff(curvatures[loop])))
+    assert work == pytest.approx(lost[30] - lost[10], rel=5e-3)
+    assert np.abs(missing).max() < 0.01 * LENGTH * 2.0 * CELL * lost[30]
+
+
+def test_spring_back_of_hinges_with_their_own_stiffness() -> None:
+    content = free_to_twist(np.linspace(0.0, 25.0, 11))
+    content["handles"][1]["until"] = 0.5
+    for key in content["motions"]["chuck"]:
+        key["time"] *= 0.5
+    content["time"]["step"] = content["petsc"]["ts_adapt_dt_max"] = 0.05
+    curvatures, moments, _ = gauged(content)
+    hardening = 5.0 * HARDENING / (4.0 + HARDENING)
+    assert abs(moments[-1]) < 1e-4 * moments[10]
+    assert curvatures[-1] == pytest.approx((1.0 - hardening) * (curvatures[10] - YIELD / 0.8), rel=0.01)
+
+
 def test_an_isotropic_strip_yields_as_its_fibres_do() -> None:
     # at the curvature 2 σ / (E h) with the stress σ on its faces
     young, thickness, path = 1e9, 1e-4, np.linspace(0.0, 2.0 * YIELD, 5)
