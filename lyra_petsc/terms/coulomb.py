@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.terms.protocols import AT_LIMIT
 
 MIN_STIFFNESS = 1e-14
 """Tangent stiffness of sliding elements over that of sticking ones, where it is replaced by a parabola."""
@@ -46,6 +47,11 @@ class FrictionLimits(NamedTuple):
         exact = np.where(np.abs(u) <= self.yield_strain, k, MIN_STIFFNESS * self.limit / self.yield_strain)
         mixed = (1.0 - convexity) * exact + convexity * k
         return mixed, 0.5 * force / mixed
+
+    def moved(self, *, yields: bool) -> FrictionLimits:
+        """Limits that all elements at theirs are beyond, or else below."""
+        factor = 1.0 - AT_LIMIT if yields else 1.0 + AT_LIMIT
+        return FrictionLimits(factor * self.limit, factor * self.yield_strain)
 
     def slid(self, u: Array) -> Array:
         """Change of q_p (E,) when the step is accepted."""

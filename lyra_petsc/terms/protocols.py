@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -19,6 +19,10 @@ from lyra_petsc.terms.term import Elastic
 
 LARGEST_ROTATION = 1.0
 """Largest angle [rad] by which a Newton iteration may rotate a director relative to its triangles."""
+
+
+AT_LIMIT = 1e-6
+"""Relative distance from its limit, within the accuracy of an equilibrium, at which an element yields."""
 
 
 KEPT_FRACTION = 0.2
@@ -119,6 +123,14 @@ class Dissipates(Stateful):
     @abstractmethod
     def heat(self, x: Array, frozen: Any) -> float:
         """Energy [J] of the owned elements that becomes heat when the step to x is accepted."""
+
+
+class Yields(Dissipates):
+    """An energy whose elements have another stiffness where they yield further than where they unload."""
+
+    @abstractmethod
+    def at_limits(self, *, yields: bool) -> Self:
+        """The same term, but all elements at their limits, to `AT_LIMIT`, yield, or else all unload."""
 
 
 class TellsEvents(Stateful):

@@ -7,6 +7,7 @@ For each triangle of rest area A with the shear strain γ = 2 E_uv of ``membrane
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,14 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.coulomb import FrictionLimits
-from lyra_petsc.terms.protocols import Dissipates, Place, TermState
+from lyra_petsc.terms.protocols import Place, TermState, Yields
 from lyra_petsc.terms.rest import RestShape
 
 YIELD_SHEAR = 0.002
 """γ_y: change of shear at which friction reaches its limit."""
 
 
-class ShearFriction(Dissipates):
+class ShearFriction(Yields):
     """Shear friction of all triangles.
 
     Parameters
@@ -76,6 +77,11 @@ class ShearFriction(Dissipates):
     def force_scale(self, size: float) -> Array:
         stiffness = self._friction.limit / self._friction.yield_strain
         return stiffness * size * np.sum(self._shape**2, axis=(1, 2))
+
+    def at_limits(self, *, yields: bool) -> ShearFriction:
+        other = copy(self)
+        other._friction = self._friction.moved(yields=yields)
+        return other
 
     # -- state -------------------------------------------------------------------------------------
 

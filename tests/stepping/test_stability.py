@@ -158,3 +158,35 @@ def test_the_hessian_is_the_derivative_of_all_forces(name: str) -> None:
         assert mode is not None
         assert mode.ravel()[free] @ symmetric @ mode.ravel()[free] < 0.0
     simulation.destroy()
+
+
+@pytest.mark.parallel(1)
+@pytest.mark.parametrize(("hardening", "stable"), [(0.01, None), (0.9, True)])
+def test_a_strip_at_its_limit_is_not_called_stable_if_it_falls_as_it_yields(
+    hardening: float, stable: bool | None
+) -> None:
+    # half its critical weight is more than the yielding root bears, less than the root that unloads
+    tip = {"box": [[0.04, -1, LENGTH - 1e-6], [0.06, 1, LENGTH + 1e-6]]}
+    content = strip(0.5)
+    content["material"] |= {"yield_curvature": 0.3, "hardening": hardening}
+    pushed = {"handles": [*content["handles"], tip | {"motion": "push", "axes": ["y"]}]}
+    motions = {"push": [{"time": 0}, {"time": 1, "translate": [0, 0.2, 0]}]}
+    time = {"analysis": "static", "step": 0.25}
+    with finished(MPI.COMM_SELF, content | pushed | {"motions": motions, "time": time}) as simulation:
+        assert simulation.stability == STABLE
+        force = simulation.energy_balance.handle_forces(2)[1]
+        x = simulation.problem.equations.x.copy()
+        state = simulation.problem.terms["hinge_plasticity"].state()
+    # now without the handle, under the same force
+    released = SteppedScene(MPI.COMM_SELF, scene_of(content | {"loads": [tip | {"force": force.tolist()}]}))
+    equations = released.problem.equations
+    equations.state.set(x, np.zeros_like(x))
+    released.problem.terms["hinge_plasticity"].restore({k: v.values for k, v in state.items()}, x)
+    equations.begin_step(0.75, 1.0)
+    equations.evaluate(equations.stationary_velocity())
+    assert np.abs(equations.out_of_balance()).max() < 1e-6 * equations.forces.largest_force()
+    with Examination(equations, LENGTH) as examination:
+        stability = examination.stability
+    released.destroy()
+    assert (stability.stable, stability.negative) == (stable, 0)
+    assert ("gives way where that yields further" in stability.reason) == (stable is None)

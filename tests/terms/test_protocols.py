@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from examples import example
 from mpi4py import MPI
-from oracle import differences, frozen_by, gradient
+from oracle import differences, frozen_by, gradient, hessian
 from physics import CLOTH, finished, grid, scene_of, shape, stepped
 
 from lyra_petsc.arrays import Array
@@ -39,6 +39,7 @@ from lyra_petsc.terms.protocols import (
     SharesFrozen,
     Stateful,
     TermState,
+    Yields,
 )
 from lyra_petsc.terms.registry import REGISTRY, Registration, Role
 from lyra_petsc.terms.rest import RestShape
@@ -130,6 +131,22 @@ def test_heat_is_what_a_step_takes_from_the_energy(name: str, tmp_path: Path) ->
         after = term.energies(x, frozen).sum()
         assert heat > 0.0
         assert before - after == pytest.approx(heat, rel=1e-9)
+
+
+@having(Yields)
+def test_elements_at_their_limits_are_softer_where_they_yield_further(name: str, tmp_path: Path) -> None:
+    with example(name, tmp_path) as simulation:
+        term = simulation.problem.terms[name]
+        assert isinstance(term, Yields)
+        frozen, x = frozen_by(term, simulation.equations), bent(simulation.equations.x, 0.1)
+        term.accept(x, frozen)
+        laws, pull = [term.at_limits(yields=yields) for yields in (False, True)], gradient(term, x, frozen)
+        for law in laws:
+            np.testing.assert_allclose(gradient(law, x, frozen), pull, rtol=0.0, atol=1e-5 * abs(pull).max())
+        stiff, soft = (hessian(law, x, frozen).reshape(x.size, x.size) for law in laws)
+        change = np.linalg.eigvalsh(stiff - soft)
+        assert change.min() > -1e-5 * change.max()
+        assert change.max() > 0.1 * np.abs(np.linalg.eigvalsh(stiff)).max()
 
 
 @having(MovingTargets)

@@ -3,6 +3,14 @@
 The Hessian is that of all energies, plus the symmetric part of the stiffness of loads that follow the shape.
 Unknowns of edges need no special treatment: if their block is positive definite, the negative pivots are
 those of the Schur complement on the vertices.
+
+Elements that have yielded in the last step have the stiffness of yielding further, as in the energy that was
+minimised. Those at their limit that have not have that of unloading; if motions have a negative stiffness
+where they let these yield further, the stability is not known. A positive one is Hill's sufficient condition
+for stability, with his linear comparison solid.
+
+Sources: R. Hill, Journal of the Mechanics and Physics of Solids 6 (1958) 236-249; H. Petryk, ibid. 39 (1991)
+691-711 (minima of incremental energies).
 """
 
 from __future__ import annotations
@@ -20,6 +28,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.following_loads import FollowingLoads
 from lyra_petsc.stepping.statics.rigid_motions import rigid_motions
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.protocols import Yields
 from lyra_petsc.terms.term import Load, Viscous
 
 MAX_VERTICES = 200_000
@@ -27,6 +36,8 @@ MAX_VERTICES = 200_000
 
 LOADS = 1e-9
 """Relative accuracy of the stiffness of loads, which is one of finite differences."""
+
+GIVES_WAY = "it holds where what has yielded unloads, and gives way where that yields further"
 
 MIN_BENDING = 0.5
 """A mode with less than this fraction on vertices with bending stiffness is a wrinkle."""
@@ -73,15 +84,16 @@ class Stability:
         } | ({"stability_unknown": self.reason} if self.reason else {})
 
 
-def add_exact_hessian(equations: StageEquations, values: Array) -> FollowingLoads:
+def add_exact_hessian(equations: StageEquations, values: Array, *, yielding: bool = False) -> FollowingLoads:
     """Add the exact Hessian [N/m] of all energies at the state to block rows (n_blocks, 3, 3).
 
     The symmetric part of the stiffness of loads that follow the shape, which are returned, is added, too.
-    Prescribed unknowns are not decoupled.
+    Prescribed unknowns are not decoupled. Elements at their limits unload, or yield further.
     """
     rows, active, here = equations.discretisation.rows, equations.active, equations.here()
     for term in active.elastic:
-        rows.add_stiffness(term, here.x, here.frozen[term], 0.0, 1.0, values)
+        law = term.at_limits(yields=yielding) if isinstance(term, Yields) else term
+        rows.add_stiffness(law, here.x, here.frozen[term], 0.0, 1.0, values)
 
     def force_of(term: Load | Viscous, x: Array, out: Array) -> None:
         """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""
@@ -110,7 +122,7 @@ class Examination:
     """
 
     def __init__(self, equations: StageEquations, size: float) -> None:
-        self._equations, self._reason, points = equations, "", equations.points
+        self._equations, self._size, self._reason, points = equations, size, "", equations.points
         self._inertia: Inertia | None = None
         if not PETSc.Sys.hasExternalPackage("mumps"):
             self._reason = "this PETSc has no MUMPS, whose factors give the inertia"
@@ -120,14 +132,14 @@ class Examination:
                 "that factors are made for"
             )
         else:
-            self._inertia = self._assemble(size)
+            self._inertia = self._assemble()
 
-    def _assemble(self, size: float) -> Inertia:
-        equations, points = self._equations, self._equations.points
+    def _assemble(self, *, yielding: bool = False) -> Inertia:
+        equations, points, size = self._equations, self._equations.points, self._size
         n = points.n_owned
         equations.update_pattern()
         values = equations.discretisation.rows.zeros()
-        loads = add_exact_hessian(equations, values)
+        loads = add_exact_hessian(equations, values, yielding=yielding)
         held, unbalanced = equations.step.prescribed.mask, equations.out_of_balance()
         sheet = next(term for term in equations.active.elastic if isinstance(term, Membrane))
         rigid = rigid_motions(points, sheet.stencil, equations.x, held, size)
@@ -149,7 +161,19 @@ class Examination:
         pivots = self._inertia.pivots()
         if pivots is None:
             return Stability(reason="there is no memory for the factors")
-        return Stability.of(pivots)
+        stability = Stability.of(pivots)
+        if stability.stable and any(isinstance(term, Yields) for term in self._equations.active.elastic):
+            return self._where_it_yields(stability)
+        return stability
+
+    def _where_it_yields(self, stability: Stability) -> Stability:
+        """Whether an equilibrium that is stable if it unloads remains so if it yields further; collective."""
+        comparison = self._assemble(yielding=True)
+        pivots = comparison.pivots()
+        comparison.destroy()
+        if pivots is None or not pivots.negative:
+            return stability
+        return replace(stability, stable=None, reason=GIVES_WAY)
 
     def solve(self, force: Array) -> Array | None:
         """Displacement (n_owned, 3) [m] for a force (n_owned, 3) [N] by the exact Hessian; collective.

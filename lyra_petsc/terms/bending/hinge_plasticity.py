@@ -12,7 +12,8 @@ Source: J. C. Simo, T. J. R. Hughes, Computational Inelasticity, Springer 1998, 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from copy import copy
+from typing import Any, Self
 
 import numpy as np
 
@@ -21,11 +22,11 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending.hinge import Bending, whole_hinges
 from lyra_petsc.terms.coulomb import FrictionLimits
-from lyra_petsc.terms.protocols import Dissipates, Place, TermState
+from lyra_petsc.terms.protocols import Place, TermState, Yields
 from lyra_petsc.terms.rest import RestShape
 
 
-class PlasticAngles(Dissipates):
+class PlasticAngles(Yields):
     """Angles that slide beyond a yield angle: the state of hinges and clamps that bend plastically.
 
     Parameters
@@ -57,6 +58,11 @@ class PlasticAngles(Dissipates):
         u = angles - self.bent
         k, c = self.limits.parabola(u) if convexity is None else self.limits.tangent(u, convexity)
         return k, angles - c
+
+    def at_limits(self, *, yields: bool) -> Self:
+        other = copy(self)
+        other.limits = self.limits.moved(yields=yields)
+        return other
 
     def initialise(self, x: Array) -> None:
         """The angles of the start, as far as they are beyond the yield angle."""

@@ -15,7 +15,8 @@ gradient p.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from copy import copy
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from lyra_petsc.terms.bending import hinge, midedge, midedge_energy
 from lyra_petsc.terms.bending.hinge import edge_in_material
 from lyra_petsc.terms.bending.midedge import NO_FRICTION, MidEdge
 from lyra_petsc.terms.bending.midedge_shape import Frames
-from lyra_petsc.terms.protocols import Dissipates, Located, Place, SharesFrozen, TermState
+from lyra_petsc.terms.protocols import AT_LIMIT, Located, Place, SharesFrozen, TermState, Yields
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Assembly, Term, UpcomingStep
 
@@ -52,7 +53,7 @@ class Sliding(NamedTuple):
     tangent: Array
 
 
-class MidEdgeFriction(Dissipates, SharesFrozen):
+class MidEdgeFriction(Yields, SharesFrozen):
     """Friction of all triangles; `connect` must be called next.
 
     Parameters
@@ -68,8 +69,8 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
 
     def __init__(self, elements: Elements) -> None:
         super().__init__(elements)
-        data = elements.data
-        self.bent: Array = data["rest"].copy()
+        self.bent: Array = elements.data["rest"].copy()
+        self._r_y = elements.data["r_y"]
 
     def connect(self, terms: Iterable[Term]) -> None:
         self.partner = sheet = next(term for term in terms if isinstance(term, MidEdge))
@@ -94,7 +95,7 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         tangent = self._sheet.at(x, frozen).geometry[self._rows]
         constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
         midedge_energy.energies(tangent, *constants, half)
-        r_y, r = data["r_y"], np.sqrt(2.0 * np.maximum(half, 0.0))
+        r_y, r = self._r_y, np.sqrt(2.0 * np.maximum(half, 0.0))
         larger = np.maximum(r, r_y)
         offset = np.where(r > r_y, 0.5 * r_y * (larger - r_y), 0.0)
         curvature = np.where(r > r_y, -1.0 / (r_y * larger), 0.0)
@@ -130,6 +131,11 @@ class MidEdgeFriction(Dissipates, SharesFrozen):
         at = into.offsets[f"{self.name} vertices"], into.offsets[self.name], into.values
         law = into.convexity, *numbers, *constants
         midedge_energy.add_hessian(x, self.stencil, *law, into.weight, *at)
+
+    def at_limits(self, *, yields: bool) -> Self:
+        other = copy(self)
+        other._r_y = self._r_y * (1.0 - AT_LIMIT if yields else 1.0 + AT_LIMIT)
+        return other
 
     def force_scale(self, size: float) -> Array:
         data = self.elements.data
