@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.measures import SAME_PLACE, mean_edge_length
 from lyra_petsc.mesh.mesh import Group, Mesh, Source
 from lyra_petsc.mesh.readers import first_few
 from lyra_petsc.mesh.select import DIMENSION_NAMES, find_group
-from lyra_petsc.mesh.topology import connected_components, edge_table, side_vertices
+from lyra_petsc.mesh.topology import Hinges, connected_components, edge_table, side_vertices
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.seam_block import Seam
 
@@ -115,6 +115,39 @@ class SewnCurves(NamedTuple):
     ties: Ties
 
 
+class SeamHinges(NamedTuple):
+    """Edges of seams, each with a triangle on either side: those of the side whose vertices are tied.
+
+    Attributes
+    ----------
+    stencil : (n, 4) int64
+        The edge's vertices, and the vertices opposite to it in the two triangles, as in ``dihedral_angle``.
+        The second triangle has the edge of the other side on which the middle of this edge lies.
+    triangles : (n, 2) int64
+    length : (n,) float64
+        Rest length of the edge [m].
+    heights : (n, 2) float64
+        Rest heights of both triangles on their edges [m].
+    seam : (n,) int64
+        Number of the seam.
+    hinge : (n,) int64
+        Number among the hinges of the mesh where both sides have the same edge, else −1.
+    start_gap : (n,) float64
+        Distance [m] of the middle of the edge from the other side in the start shape.
+    start_angle : (n,) float64
+        Dihedral angle [rad] in the start shape, as if there were no gap.
+    """
+
+    stencil: Ints
+    triangles: Ints
+    length: Array
+    heights: Array
+    seam: Ints
+    hinge: Ints
+    start_gap: Array
+    start_angle: Array
+
+
 def sewn_curves(scene: Scene, mesh: Mesh) -> list[SewnCurves]:
     """The curves of all seams of a scene, before or after `join_seams`.
 
@@ -178,7 +211,7 @@ def _begun_at(mesh: Mesh, curve: SeamSide, point: Array) -> SeamSide:
 
 
 class _Edges:
-    """Rest lengths of the mesh's edges, and numbers of their triangles, by their vertices."""
+    """The mesh's edges by their vertices: rest lengths, numbers of their triangles, and their sides."""
 
     def __init__(self, mesh: Mesh) -> None:
         table, uv = edge_table(mesh.triangles), mesh.triangle_uv
@@ -186,15 +219,23 @@ class _Edges:
         ends = np.sort(side_vertices(mesh.triangles, first)[:, :2], axis=1)
         length = np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2).ravel()
         self._n, self._length, self._count = mesh.n_vertices, length[first], table.sizes
+        self._table = table
         self._key = ends[:, 0] * self._n + ends[:, 1]  # ascending
 
     def of(self, edges: Ints) -> tuple[Array, Ints]:
         """Lengths [m] and numbers of triangles, 0 where there is no such edge, of edges (k, 2)."""
+        at, known = self._places(edges)
+        return np.where(known, self._length[at], 0.0), np.where(known, self._count[at], 0)
+
+    def sides(self, edges: Ints, which: Ints | int = 0) -> Ints:
+        """Number (k,), as in `EdgeTable`, of the first side, or another one, of edges (k, 2) of the mesh."""
+        return self._table.sides[self._table.first[self._places(edges)[0]] + which]
+
+    def _places(self, edges: Ints) -> tuple[Ints, Mask]:
         low, high = np.sort(edges, axis=1).T
         key = low * self._n + high
         at = np.minimum(np.searchsorted(self._key, key), len(self._key) - 1)
-        known = self._key[at] == key
-        return np.where(known, self._length[at], 0.0), np.where(known, self._count[at], 0)
+        return at, np.asarray(self._key[at] == key)
 
 
 def _curve(mesh: Mesh, edges: _Edges, name: str, key: str, file: object | None) -> SeamSide:
@@ -276,6 +317,63 @@ def join_seams(scene: Scene, mesh: Mesh) -> Mesh:
 def tied_pairs(scene: Scene, mesh: Mesh) -> Ints:
     """Pairs of vertices (n, 2) that the seams of a scene hold together, of the mesh from `join_seams`."""
     return np.concatenate([sewn.ties.pairs() for sewn in sewn_curves(scene, mesh)])
+
+
+def seam_hinges(scene: Scene, mesh: Mesh, hinges: Hinges) -> SeamHinges:
+    """The hinges across the seams of a scene, of the mesh from `join_seams` with these ``hinges``."""
+    edges, curves = _Edges(mesh), sewn_curves(scene, mesh)
+    parts = [_hinges_of(mesh, edges, hinges, number, sewn) for number, sewn in enumerate(curves)]
+    return SeamHinges(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _hinges_of(mesh: Mesh, edges: _Edges, hinges: Hinges, number: int, sewn: SewnCurves) -> SeamHinges:
+    fine, coarse = sewn.sides[sewn.tied], sewn.sides[1 - sewn.tied]
+    middle = 0.5 * (fine.place[1:] + fine.place[:-1]) / fine.length * coarse.length
+    at = np.clip(np.searchsorted(coarse.place, middle, side="right") - 1, 0, len(coarse.place) - 2)
+    part = ((middle - coarse.place[at]) / np.diff(coarse.place)[at])[:, None]
+    own, other = (
+        np.stack([curve.vertices[rows], curve.vertices[rows + 1]], axis=1)
+        for curve, rows in ((fine, np.arange(len(middle))), (coarse, at))
+    )
+    joined = (np.sort(own, axis=1) == np.sort(other, axis=1)).all(axis=1)
+    sides = [edges.sides(own), edges.sides(other, joined.astype(np.int64))]
+    corners = [side_vertices(mesh.triangles, side) for side in sides]
+    # the angle's sign is by the normals of the seam's first side
+    forwards = corners[0][:, 0] == own[:, 0] if sewn.tied == 0 else corners[1][:, 0] == other[:, 1]
+    stencil = np.column_stack(
+        [np.where(forwards[:, None], own, own[:, ::-1]), corners[0][:, 2], corners[1][:, 2]]
+    )
+    uv, (face, corner) = mesh.triangle_uv, np.divmod(sides, 3)
+    length = np.linalg.norm(uv[face, (corner + 1) % 3] - uv[face, corner], axis=2)
+    twice = np.abs(np.linalg.det(uv[face][:, :, 1:] - uv[face][:, :, :1]))
+    hinge = np.full(len(own), -1)
+    if joined.any():
+        keys = [np.sort(pairs, axis=1) @ [mesh.n_vertices, 1] for pairs in (hinges.vertices[:, :2], own)]
+        order = np.argsort(keys[0])
+        row = order[np.minimum(np.searchsorted(keys[0][order], keys[1]), len(order) - 1)]
+        hinge = np.where(joined & (keys[0][row] == keys[1]), row, -1)
+    points = mesh.positions[stencil]
+    first, second = mesh.positions[other].transpose(1, 0, 2)
+    gap = points[:, :2].mean(axis=1) - (1.0 - part) * first - part * second
+    points[:, 3] += gap
+    return SeamHinges(
+        stencil,
+        face.T,
+        length[0],
+        (twice / length).T,
+        np.full(len(own), number),
+        hinge,
+        np.linalg.norm(gap, axis=1),
+        _folds(points),
+    )
+
+
+def _folds(points: Array) -> Array:
+    """Dihedral angles (n,) [rad] of hinges at points (n, 4, 3)."""
+    edge, first, second = (points[:, 1:] - points[:, :1]).transpose(1, 0, 2)
+    one, two = np.cross(edge, first), np.cross(second, edge)
+    sine = np.sum(np.cross(one, two) * edge, axis=1) / np.linalg.norm(edge, axis=1)
+    return np.arctan2(sine, np.sum(one * two, axis=1))
 
 
 def _links(same: Ints) -> Ints:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
@@ -64,11 +64,18 @@ class Seam(Block):
         For closed curves: the vertices nearest to this point at the start are where both curves begin.
     close : Closing or None
         Time in which threads pull the seam together; without it the seam is closed from the beginning. Where
-        the vertices of both sides coincide at the start and the seam is rigid, they become one, and the sheet
-        bends there as elsewhere; threads let it bend freely.
+        the vertices of both sides coincide at the start and the seam is rigid, they become one.
     stiffness : "rigid" or float [N/m²]
         Force per length of the seam and distance of its sides; ``rigid``: 1000 times the membrane stiffness
         over the edge length, so that the sides are less than 1e-4 of an edge apart at strains up to 10 %.
+    angle : "free", "rest" or float [°]
+        Bending across the seam: none; towards the angle between its sides in the start shape; or towards an
+        angle from flat, positive where both sides turn towards the normals of the first one. In a seam that
+        closes, bending begins when the sides are as near as their triangles are high.
+    bending : float [N·m] or None
+        Bending stiffness across the seam; by default that of the softer one of its sides. Without it, sides
+        whose vertices become one bend at the seam as within a sheet, by its bending model. Else each edge
+        of the side with more vertices and the triangle on the other side of it are a hinge.
     """
 
     between: Annotated[tuple[Name, Name], BeforeValidator(_two_names)]
@@ -80,10 +87,14 @@ class Seam(Block):
         _word_or_number("rigid"),
         WithJsonSchema({"anyOf": [{"const": "rigid"}, {"type": "number", "exclusiveMinimum": 0}]}),
     ] = "rigid"
-    unsupported: ClassVar[dict[str, str]] = dict.fromkeys(
-        ("angle", "bending"),
-        "is not known: a seam that is pulled together bends freely, one that is joined as the sheet does",
-    )
+    angle: Annotated[
+        float | Literal["free", "rest"],
+        _word_or_number("free", "rest"),
+        WithJsonSchema(
+            {"anyOf": [{"enum": ["free", "rest"]}, {"type": "number", "minimum": -180, "maximum": 180}]}
+        ),
+    ] = "free"
+    bending: NonNegative | None = None
 
     @property
     def rigid(self) -> bool:
@@ -91,12 +102,24 @@ class Seam(Block):
         return self.stiffness == "rigid"
 
     @property
+    def bends_as_sheet(self) -> bool:
+        """Whether joined sides bend at the seam as within a sheet."""
+        return self.angle != "free" and self.bending is None
+
+    @property
     def label(self) -> str:
         """Name of the seam in output."""
         return " - ".join(self.between)
 
     def check(self) -> None:
-        """Refuse a group that is sewn to itself, and a stiffness out of range."""
+        """Refuse a group that is sewn to itself, values out of range, and bending of a free seam."""
         require(self.between[0] != self.between[1], "must be two groups, not one and the same", "between")
         if not isinstance(self.stiffness, str):
             require(self.stiffness > 0.0, f"must be > 0, not {self.stiffness:g}", "stiffness")
+        if not isinstance(self.angle, str):
+            half_turn = f"must be free, rest or between -180 and 180 degrees, not {self.angle:g}"
+            require(abs(self.angle) < 180.0, half_turn, "angle")
+        useless = self.bending is not None and self.angle == "free"
+        require(
+            not useless, "needs angle: rest, or degrees; with angle: free the seam bends freely", "bending"
+        )

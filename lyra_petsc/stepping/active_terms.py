@@ -14,6 +14,7 @@ from lyra_petsc.terms.protocols import (
     GlobalSums,
     HasDirectors,
     HasGeometry,
+    HoldsTogether,
     LimitsStep,
     MovingTargets,
     SharesFrozen,
@@ -42,6 +43,8 @@ class ActiveTerms:
     terms : sequence of Term
     obstacles_move : bool
         Whether the obstacles of contact do.
+    damps_stiff : bool
+        As that of the integrator.
 
     Attributes
     ----------
@@ -56,6 +59,8 @@ class ActiveTerms:
         Terms of ``sheet`` with moving targets or obstacles; those with targets; that with obstacles.
     limiting : list of LimitsStep
         Terms that limit the length of steps, besides contact.
+    holding : list of HoldsTogether
+        Those that need an integrator that damps stiff motions, if the scene's does not.
     stateful, dissipating, telling : list of Stateful
         Terms with a state; those of which steps make heat; those with events for the user.
     of_contact, sliding, barriers : list of Elastic
@@ -68,7 +73,7 @@ class ActiveTerms:
         The terms that replace terms with unknowns of edges on coarse levels of multigrid.
     """
 
-    def __init__(self, terms: Sequence[Term], *, obstacles_move: bool) -> None:
+    def __init__(self, terms: Sequence[Term], *, obstacles_move: bool, damps_stiff: bool) -> None:
         self.elastic = [term for term in terms if isinstance(term, Elastic)]
         self.viscous = [term for term in terms if isinstance(term, Viscous)]
         self.loads = [term for term in terms if isinstance(term, Load)]
@@ -84,6 +89,7 @@ class ActiveTerms:
         self.dissipating = [term for term in self.sheet if isinstance(term, Dissipates)]
         limiting = [term for term in self.elastic if isinstance(term, LimitsStep)]
         self.limiting = [term for term in limiting if not term.registration.of_contact]
+        self.holding = [t for t in self.elastic if isinstance(t, HoldsTogether) and not damps_stiff]
         self.stateful = [term for term in self.elastic if isinstance(term, Stateful)]
         self.telling = [term for term in self.stateful if isinstance(term, TellsEvents)]
         self.sliding: list[Any] = [term for term in self.external if term.registration.of_contact]
@@ -123,12 +129,12 @@ class ActiveTerms:
 
     def limits_act(self, x: Array, frozen: Frozen, layout: Layout) -> bool:
         """Whether any term that limits steps acts at positions x (n_local, 3): its forces change too abruptly
-        for one linear solve; collective.
+        for one linear solve; or whether parts that one holds together are apart; collective.
         """
-        terms = self.limiting
-        return bool(terms) and any(
-            layout.global_max(any(term.energies(x, frozen[term]).any() for term in terms))
-        )
+        if not (self.limiting or self.holding):
+            return False
+        acts = any(term.energies(x, frozen[term]).any() for term in self.limiting)
+        return any(layout.global_max(acts or any(t.are_apart(x, frozen[t]) for t in self.holding)))
 
     def accept_substep(
         self, x: Array, frozen: Frozen, start: tuple[Array, Mapping[Any, Any]] | None

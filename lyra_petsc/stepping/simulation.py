@@ -238,7 +238,7 @@ class SteppedScene:
         self.last_integrator = equations.integrator
         usual, in_contact = integrators.usual, integrators.in_contact
         if equations.integrator is in_contact is not usual and usual.iterates:
-            text = f"{in_contact.name} takes the steps in which something touches or nears a limit"
+            text = f"{in_contact.name} takes the steps in which something touches, nears a limit or closes"
             self.run_notes.once("in contact", text)
         if self.accuracy is not None:
             self.accuracy.record_step(v_owned, dt, self.step_number, self.time, self.run_notes)

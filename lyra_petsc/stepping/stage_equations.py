@@ -62,7 +62,7 @@ class StageEquations:
     load_case, forces, active, damping, directors, prescriptions, reference, integrators : parts
     predicted_stress, start_acceleration : parts
     nears_limit : bool
-        Whether a term that limits steps acts at the positions of the state; contact is apart.
+        `ActiveTerms.limits_act` at the positions of the state; contact is apart.
     has_active_pairs : bool
         Whether any pair of a term with changing stencils acted when the block rows were last renewed.
     """
@@ -85,8 +85,8 @@ class StageEquations:
     ) -> None:
         self.discretisation, self.mass = discretisation, mass
         moves = contact is not None and contact.obstacles_move
-        self.active = active = ActiveTerms(terms, obstacles_move=moves)
-        limited = contact is not None or bool(active.limiting)
+        self.active = active = ActiveTerms(terms, obstacles_move=moves, damps_stiff=integrator.damps_stiff)
+        limited = contact is not None or bool(active.limiting or active.holding)
         self.integrators = IntegratorsInUse(integrator, limited=limited)
         discretisation.when_ghosts_change(self._follow_ghosts)
         self.contact, self.held = contact, held

@@ -173,6 +173,18 @@ class LimitsStep(Elastic):
         return size
 
 
+class HoldsTogether(Elastic):
+    """An energy so stiff that it holds parts together, once they are.
+
+    While they are apart, an integrator that does not damp stiff motions would let them swing against each
+    other for ever: that for contact takes the steps.
+    """
+
+    @abstractmethod
+    def are_apart(self, x: Array, frozen: Any) -> bool:
+        """Whether parts of any owned element are apart at positions x (n_local, 3)."""
+
+
 class FollowsHandles(Elastic):
     """An energy of the distance from targets that move with handles."""
 

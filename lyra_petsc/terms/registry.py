@@ -183,6 +183,13 @@ REGISTRY: list[Registration] = [
     ),
     Registration("seam", lambda scene, shells: bool(scene.seams), Role.ELASTIC, "seam_energy"),
     Registration(
+        "seam_bending",
+        lambda scene, shells: any(seam.angle != "free" for seam in scene.seams),
+        Role.ELASTIC,
+        BENDING,
+        damped=True,
+    ),
+    Registration(
         "contact",
         lambda scene, shells: scene.contact is not None,
         Role.ELASTIC,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,13 @@ from lyra_petsc.mesh.select import in_group, select_triangles
 from lyra_petsc.mesh.topology import Hinges, hinges, junctions, unique_edges
 from lyra_petsc.scene.materials.library import ShellMaterial, resolve_material
 from lyra_petsc.scene.schema import Scene
+
+if TYPE_CHECKING:
+    from lyra_petsc.mesh.seams import SeamHinges
+
+
+LARGEST_FOLD = np.radians(179.9)
+"""Angle [rad] at the start from which a fold has no side that round-off does not choose."""
 
 
 class RestShape:
@@ -137,6 +145,71 @@ class RestShape:
                 )
             crease[chosen] = number
         return crease
+
+    @cached_property
+    def seam_hinges(self) -> SeamHinges:
+        """The hinges across the seams of the scene."""
+        from lyra_petsc.mesh.seams import seam_hinges  # only scenes with seams need it
+
+        return seam_hinges(self.scene, self.mesh, self.hinges)
+
+    @cached_property
+    def own_bending(self) -> NDArray[np.bool_]:
+        """Whether the sheet's bending leaves out each of the ``hinges``, (H,): at creases, and where seams
+        join its edges without bending as the sheet.
+        """
+        own = self.crease_of >= 0
+        if self.scene.seams:
+            as_sheet = np.array([seam.bends_as_sheet for seam in self.scene.seams])
+            sewn = self.seam_hinges
+            own[sewn.hinge[(sewn.hinge >= 0) & ~as_sheet[sewn.seam]]] = True
+        return own
+
+    @cached_property
+    def seam_angles(self) -> NDArray[np.float64]:
+        """Rest angle [rad] that a seam gives to the sheet's bending at each of the ``hinges``, (H,), or NaN.
+
+        Raises
+        ------
+        InputError
+            As `sewn_angles`.
+        """
+        angles = np.full(len(self.hinges.vertices), np.nan)
+        if self.scene.seams:
+            sewn = self.seam_hinges
+            joined = sewn.hinge >= 0
+            angles[sewn.hinge[joined]] = self.sewn_angles[joined]
+            angles[self.own_bending] = np.nan
+        return angles
+
+    @cached_property
+    def sewn_angles(self) -> NDArray[np.float64]:
+        """Rest angle [rad] of each of the ``seam_hinges``, (n,); NaN where seams bend freely.
+
+        Raises
+        ------
+        InputError
+            Edges that are in a crease, too; or a seam that keeps the angle of a start shape folded by 180°.
+        """
+        scene, sewn = self.scene, self.seam_hinges
+        angles = np.full(len(sewn.seam), np.nan)
+        for number, seam in enumerate(scene.seams):
+            mine, key = sewn.seam == number, f"seams[{number}].angle"
+            if isinstance(seam.angle, float):
+                angles[mine] = -np.radians(seam.angle)
+            elif seam.angle == "rest":
+                angles[mine] = sewn.start_angle[mine]
+                if (np.abs(angles[mine]) > LARGEST_FOLD).any():
+                    message = (
+                        "the start shape is folded by 180° at the seam, to an unknown side; give degrees"
+                    )
+                    raise InputError(message, file=scene.source, key=key)
+            bends = sewn.hinge[mine & ~np.isnan(angles) & (sewn.hinge >= 0)]
+            if len(creased := bends[self.crease_of[bends] >= 0]):
+                block = scene.creases[self.crease_of[creased[0]]].group
+                message = f"an edge of the seam is in the crease '{block}', too; leave one of them out"
+                raise InputError(message, file=scene.source, key=key)
+        return angles
 
     def _check_junctions(self) -> None:
         """Refuse edges of more than two triangles, for which a hinge's angle is undefined."""

@@ -1,10 +1,11 @@
 """Seams: threads between each vertex of one side and its place on an edge of the other side.
 
-    energy = ½ k s max(0, |d| − L(t))²,   d = x_i − (1 − w) x_j − w x_k
+    energy = ½ k s (|d| − L(t))²,   d = x_i − (1 − w) x_j − w x_k
 
 with the vertex's arc length s [m] and the seam's stiffness k [N/m²]. The length L goes from the distance at
-the start to zero while the seam closes. Threads pull and never push, so the energy is a convex, increasing
-function of |d|, hence convex: its exact Hessian is positive semidefinite. Closed seams have a quadratic one.
+the start to zero while the seam closes. Threads also push: if they did not, a side would fly on as they slow
+down, and be thrown back and forth between slack threads, the faster the shorter they are. Closed seams have
+a quadratic energy.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.mesh.seams import Ties, sewn_curves
+from lyra_petsc.mesh.seams import AT_VERTEX, Ties, sewn_curves
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.seam_block import Seam
-from lyra_petsc.terms.protocols import MovingTargets, WritesTable
+from lyra_petsc.terms.protocols import HoldsTogether, MovingTargets, WritesTable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import UpcomingStep
 
@@ -47,7 +48,7 @@ def closed_part(seam: Seam, time: float) -> float:
     return s * s * (3.0 - 2.0 * s)
 
 
-class SeamThreads(MovingTargets, WritesTable):
+class SeamThreads(MovingTargets, HoldsTogether, WritesTable):
     """The threads of all seams.
 
     Parameters
@@ -71,7 +72,7 @@ class SeamThreads(MovingTargets, WritesTable):
         self._factors = np.stack(
             [np.ones_like(data["weight"]), data["weight"] - 1.0, -data["weight"]], axis=1
         )
-        self._seams = seams
+        self._seams, self._rigid = seams, np.array([seam.rigid for seam in seams])[self._seam]
 
     def freeze(self, step: UpcomingStep) -> ThreadLengths:
         # with lengths that change evenly in a step, threads have theirs at its end also where the stage of
@@ -90,7 +91,7 @@ class SeamThreads(MovingTargets, WritesTable):
         """Tensions (E,) [N], and directions (E, 3) of d."""
         distance = np.linalg.norm(d, axis=1)
         direction = np.divide(d, distance[:, None], out=np.zeros_like(d), where=distance[:, None] > 0.0)
-        return self._k * np.maximum(distance - frozen.length, 0.0), direction
+        return self._k * (distance - frozen.length), direction
 
     def energies(self, x: Array, frozen: ThreadLengths) -> Array:
         tension, _ = self._pulls(self._gaps(x), frozen)
@@ -104,13 +105,14 @@ class SeamThreads(MovingTargets, WritesTable):
     def hessians(
         self, x: Array, frozen: ThreadLengths, lo: int, hi: int, convexity: float, out: Array
     ) -> None:
-        # the same for any convexity, as the energy is convex
         d = self._gaps(x)
         tension, direction = (values[lo:hi] for values in self._pulls(d, frozen))
         distance, k, length = np.linalg.norm(d[lo:hi], axis=1), self._k[lo:hi], frozen.length[lo:hi]
         # of a thread without length the energy is ½ k |d|²
         across = np.divide(tension, distance, out=np.where(length > 0.0, 0.0, k), where=distance > 0.0)
-        along = np.where(tension > 0.0, k, across) - across
+        # threads that push are unstable across
+        across = np.where(across < 0.0, (1.0 - convexity) * across, across)
+        along = k - across
         block = along[:, None, None] * direction[:, :, None] * direction[:, None, :]
         block += across[:, None, None] * np.eye(3)
         factors = self._factors[lo:hi]
@@ -119,6 +121,11 @@ class SeamThreads(MovingTargets, WritesTable):
     def targets(self, x: Array, frozen: ThreadLengths) -> tuple[Array, Array]:
         tension, _ = self._pulls(self._gaps(x), frozen)
         return frozen.length[: self.n_owned], -tension[: self.n_owned]
+
+    def are_apart(self, x: Array, frozen: ThreadLengths) -> bool:
+        edge = np.linalg.norm(x[self.stencil[:, 2]] - x[self.stencil[:, 1]], axis=1)
+        apart = np.linalg.norm(self._gaps(x), axis=1) > AT_VERTEX * edge
+        return bool((apart & self._rigid)[: self.n_owned].any())
 
     def force_scale(self, size: float) -> Array:
         return self._k * size

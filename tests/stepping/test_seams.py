@@ -44,7 +44,6 @@ def panels(n_front: int, n_back: int, gap: float, seam: dict[str, Any], **more: 
         ({"start": [0, 0, 0]}, "for closed curves"),
         ({"close": {"from": 1, "until": 1}}, "later than from"),
         ({"stiffness": -1}, "> 0"),
-        ({"angle": 30}, "bends freely"),
     ],
 )
 def test_what_cannot_be_sewn_is_refused(seam: dict[str, Any], words: str) -> None:
@@ -92,9 +91,7 @@ def test_a_seam_closes_and_stays_closed(comm: MPI.Comm, integrator: str) -> None
         assert isinstance(term, SeamThreads)
         here = simulation.problem.equations.here()
         ((_, gap, *_),) = term.table_rows(here.x, here.frozen[term])
-        # midpoint leaves undamped what is open where the threads end to shrink
-        largest = 2e-3 if integrator == "midpoint" else 1e-4 * 0.2 / 6
-        assert gap < largest
+        assert gap < 1e-4 * 0.2 / 6
 
 
 def test_the_work_of_the_threads_is_that_of_their_tension(comm: MPI.Comm) -> None:

@@ -42,6 +42,17 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
         ],
         "seams": [{"between": ["front/right", "back/left"], "close": {"from": 1.0, "until": 2.0}}],
     },
+    "seam_bending": {
+        "mesh": [
+            {"grid": {"width": 1.0, "height": 0.7, "nx": 2, "ny": 3}, "name": "front"},
+            {
+                "grid": {"width": 0.7, "height": 0.7, "nx": 2, "ny": 2},
+                "name": "back",
+                "transform": {"translate": [1.0, 0.0, 0.0]},
+            },
+        ],
+        "seams": [{"between": ["front/right", "back/left"], "angle": "rest", "bending": 2.0e-3}],
+    },
     "clamp": {"handles": [{"nodes": [0, 1, 2, 3], "clamp": True}]},
     "attachments": {
         "attachments": [

@@ -15,13 +15,13 @@ class IntegratorsInUse:
     ----------
     usual : Integrator
     limited : bool
-        Whether the scene has contact or other limits of steps.
+        Whether the scene has contact, other limits of steps, or parts to hold together.
 
     Attributes
     ----------
     present, usual, in_contact : Integrator
         That of the step, the scene's, and the one that takes the steps in which something touches
-        or nears a limit.
+        or nears a limit, or parts that are to be held together are apart.
     """
 
     def __init__(self, usual: Integrator, *, limited: bool) -> None:

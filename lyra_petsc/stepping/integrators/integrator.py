@@ -117,6 +117,8 @@ class Integrator(NoHistory, ABC):
     gain_window : int
         Number of steps over which the energy guard averages gains: multistep methods alternate between gains
         and losses.
+    damps_stiff : bool
+        Whether the motion of stiff parts is damped, so that these come to rest.
     moves_uniformly : bool
         Whether the velocity of the stage is the displacement of the step over Δt.
     handles_at_stage : bool
@@ -132,6 +134,7 @@ class Integrator(NoHistory, ABC):
     dynamic: ClassVar[bool] = True
     centred: ClassVar[bool] = False
     gain_window: ClassVar[int] = 1
+    damps_stiff: ClassVar[bool] = True
     moves_uniformly: ClassVar[bool] = False
     handles_at_stage: bool = False
 

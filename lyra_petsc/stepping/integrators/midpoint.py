@@ -15,6 +15,7 @@ class Midpoint(Integrator):
     ts_type = "theta"
     centred = True
     handles_at_stage = True
+    damps_stiff = False
     moves_uniformly = True
 
     def for_contact(self) -> Integrator:

@@ -266,8 +266,8 @@ def mirrored_angles(rest: RestShape, corners: NDArray[np.int64], triangle: NDArr
 
 
 def whole_hinges(rest: RestShape, model: str = "hinge") -> tuple[Elements, NDArray[np.int64]]:
-    """All interior edges but creases between materials of this bending model, with the constants of elastic
-    bending, and the triangle (E,) of which each has the material (rank 0).
+    """All interior edges between materials of this bending model, but those of `RestShape.own_bending`, with
+    the constants of elastic bending, and the triangle (E,) of which each has the material (rank 0).
 
     Between two materials that of smaller B is taken, as in the original Lyra. The rest length is the mean
     over the two triangles, which differ at a seam.
@@ -286,7 +286,9 @@ def whole_hinges(rest: RestShape, model: str = "hinge") -> tuple[Elements, NDArr
     rest_angle[surface] = dihedral_angles(rest.mesh.rest, quad[surface])
     if any(shell.rest_curvature for shell in rest.shells):
         rest_angle += _angles_from_curvature(rest, quad, faces)
-    bends = (b > 0.0) & (rest.crease_of < 0)
+    if rest.scene.seams:
+        rest_angle = np.where(np.isnan(rest.seam_angles), rest_angle, rest.seam_angles)
+    bends = (b > 0.0) & ~rest.own_bending
     data = {
         "k": b * length**2 / (2.0 * areas),
         "rest_angle": rest_angle,

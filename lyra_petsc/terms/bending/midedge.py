@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -487,6 +487,9 @@ def elements(rest: RestShape) -> Elements:
         _align_with_symmetry(director, rest, triangles, number, mesh.rest)
         angle[surface] = _angles_at(mesh.rest, triangles[surface], director[number[surface]])
         rest.notes += midedge_mesh.coarse_surface_notes(rest, chosen, number, size, curvature, angle)
+    if rest.scene.seams:
+        sewn = _of_edges(rest, ~np.isnan(rest.seam_angles), 0.5 * rest.seam_angles, np.nan)[number]
+        angle = np.where(np.isnan(sewn), angle, sewn)
     rest_rotation = np.stack([np.cos(angle), np.sin(angle)], axis=2)
     rest_tangent = np.zeros_like(size)
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
@@ -494,7 +497,7 @@ def elements(rest: RestShape) -> Elements:
         rest_tangent[:] = np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
         _check_rest_curvature(rest_tangent, rest, chosen, size)
     director = mean_directors(mesh.positions, triangles, number, n_edges, rest_rotation)
-    if rest.scene.creases:
+    if rest.scene.creases or rest.scene.seams:
         _release_creases(form, director, rest, chosen, number, rest_rotation)
     _align_with_symmetry(director, rest, triangles, number, mesh.positions)
     director = director[number]
@@ -540,12 +543,16 @@ def _release_creases(
 
 def _first_triangles_at_creases(rest: RestShape) -> Ints:
     """The first triangle at each edge of the mesh, (n_edges,); −1 for edges that are no creases."""
-    chosen = rest.crease_of >= 0
+    return _of_edges(rest, rest.own_bending, rest.hinges.triangles[:, 0], -1)
+
+
+def _of_edges(rest: RestShape, chosen: Mask, values: NDArray[Any], missing: float) -> NDArray[Any]:
+    """The values (H,) of the chosen hinges (H,) on all edges of the mesh, (n_edges,)."""
     keys = rest.edges[:, 0] * rest.mesh.n_vertices + rest.edges[:, 1]
     low, high = np.sort(rest.hinges.vertices[chosen, :2], axis=1).T
-    first = np.full(len(rest.edges), -1, dtype=np.int64)
-    first[np.searchsorted(keys, low * rest.mesh.n_vertices + high)] = rest.hinges.triangles[chosen, 0]
-    return first
+    out = np.full(len(rest.edges), missing, dtype=values.dtype)
+    out[np.searchsorted(keys, low * rest.mesh.n_vertices + high)] = values[chosen]
+    return out
 
 
 def condense_creases(form: Array, rest: RestShape, number: Ints) -> None:

@@ -195,7 +195,7 @@ def sliding_elements(rest: RestShape, stiffness: Array, limit: Array, *also: str
     form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness[shell], curvature)
     rows = stiffness[shell, 0, 0] > 0.0
     assert triangles.edges is not None
-    if rest.scene.creases:
+    if rest.scene.creases or rest.scene.seams:
         part = form[rows]
         midedge.condense_creases(part, rest, triangles.edges[rows])
         form[rows] = part
@@ -220,7 +220,7 @@ def coarse_elements(rest: RestShape) -> Elements:
     """Hinges between the same triangles, which bend like them while nothing slides."""
     quad, faces = rest.hinges.vertices, rest.hinges.triangles
     moments = np.array([shell.friction_moment for shell in rest.shells])
-    limit, bends = np.full(len(quad), np.inf), rest.crease_of < 0
+    limit, bends = np.full(len(quad), np.inf), ~rest.own_bending
     for side in range(2):
         edge, stiffness = edge_in_material(rest, faces[:, side], quad[:, 0], quad[:, 1], "midedge")
         across = edge[:, ::-1] ** 2 / np.sum(edge * edge, axis=1, keepdims=True)
