@@ -6,6 +6,7 @@ import re
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from lyra_petsc.scene.text import read_bytes
 
 # keywords that are ignored without a note
 _IGNORED = re.compile(
-    "v[np]|[lps]|mtllib|maplib|usemap|bevel|[cd]_interp|lod|cstype|deg|bmat|step|curv2?|surf|parm|trim|"
+    "v[np]|[ps]|mtllib|maplib|usemap|bevel|[cd]_interp|lod|cstype|deg|bmat|step|curv2?|surf|parm|trim|"
     "hole|scrv|sp|end|con|mg|shadow_obj|trace_obj|[cs]tech"
 )
 
@@ -28,7 +29,7 @@ MAX_CORNERS = 256
 
 @dataclass
 class _Raw:
-    """The content of the lines as flat lists; indices count from 0, −1 stands for a missing ``vt``."""
+    """The content of the lines; indices count from 0, −1 stands for a missing ``vt``."""
 
     points: array[float] = field(default_factory=lambda: array("d"))
     uv: array[float] = field(default_factory=lambda: array("d"))
@@ -37,6 +38,7 @@ class _Raw:
     face_size: array[int] = field(default_factory=lambda: array("q"))
     face_line: array[int] = field(default_factory=lambda: array("q"))
     spans: list[tuple[str, int, int]] = field(default_factory=list)
+    curves: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
     unknown: dict[str, int] = field(default_factory=dict)
 
 
@@ -44,9 +46,9 @@ def read_obj(path: Path) -> Sheet:
     """Read an .obj file.
 
     It reads ``v``, ``vt``, ``f`` (``a``, ``a/b``, ``a//c``, ``a/b/c``, negative numbers, polygons), and
-    ``g``, ``o`` and ``usemtl`` as surface groups; a backslash continues a line. Other keywords are ignored,
-    with a note if they are unknown. Quads are split along the shorter diagonal, larger polygons into a fan.
-    Vertices in no face are dropped with a note.
+    ``g``, ``o`` and ``usemtl`` as surface groups; ``l`` after ``g`` are the edges of a group of curves; a
+    backslash continues a line. Other keywords are ignored, with a note if they are unknown. Quads are split
+    along the shorter diagonal, larger polygons into a fan. Vertices in no face are dropped with a note.
 
     Raises
     ------
@@ -85,6 +87,12 @@ def read_obj(path: Path) -> Sheet:
         for name, begin, end in raw.spans
         if end > begin
     ]
+    for name, edges in raw.curves.items():
+        members = np.array(edges, dtype=np.int64)
+        if members.max() >= len(points):
+            message = f"no vertex {members.max() + 1} for the edges of '{name}'; the file has {len(points)}"
+            raise InputError(message, file=path)
+        sheet.groups.append(NamedSet(name, 1, members))
     drop_loose_vertices(sheet)
     return sheet
 
@@ -110,6 +118,10 @@ def _parse(text: str, path: Path) -> _Raw:
                 raw.points.extend((float(x), float(y), float(z)))
             elif word == "f":
                 _parse_face(raw, parts, number)
+            elif word == "l":
+                edges = _parse_line(raw, parts)
+                for name in open_groups["g"]:
+                    raw.curves.setdefault(name, []).extend(edges)
             elif word == "vt":
                 raw.uv.extend((float(parts[1]), float(parts[2]) if len(parts) > 2 else 0.0))
             elif word == "g":
@@ -143,6 +155,14 @@ def _parse_face(raw: _Raw, parts: list[str], number: int) -> None:
         raw.corner_uv.append(_from_zero(int(fields[1]), len(raw.uv) // 2, "vt") if has_uv else -1)
     raw.face_size.append(len(parts) - 1)
     raw.face_line.append(number)
+
+
+def _parse_line(raw: _Raw, parts: list[str]) -> list[tuple[int, int]]:
+    """The edges of a line through two vertices or more."""
+    if len(parts) < 3:
+        raise _FaceError("a line has at least two vertices")
+    vertices = [_from_zero(int(part.split("/")[0]), len(raw.points) // 3, "vertex") for part in parts[1:]]
+    return list(pairwise(vertices))
 
 
 def _from_zero(index: int, count: int, kind: str) -> int:

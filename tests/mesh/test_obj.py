@@ -79,6 +79,26 @@ def test_groups_and_objects_name_surfaces(tmp_path: Path) -> None:
     assert groups["sail cloth"].triangles.tolist() == [0, 1]
 
 
+def test_lines_in_a_group_name_curves(tmp_path: Path) -> None:
+    curves = "g hem low\nl 2/1 3/1 -2\ng hem\nl 5 4\nl 1 2\ng\nl 5 2\n"
+    text = "o sail\nv 9 9 9\n" + SQUARE + "f 2 3 4 5\n" + curves
+    groups = obj_mesh(tmp_path, text).groups
+    assert groups["hem"].dimension == 1
+    assert groups["hem"].edges.tolist() == [[0, 1], [1, 2], [2, 3]]  # that of the dropped vertex is left out
+    assert groups["low"].edges.tolist() == [[0, 1], [1, 2]]
+    assert groups["sail"].dimension == 2
+    assert set(groups) == {"hem", "low", "sail"}
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [("l 1", "at least two"), ("l 1 0", "no vertex 0"), ("l 1 9", "no vertex 9 for the edges")],
+)
+def test_lines_that_are_no_edges_are_refused(tmp_path: Path, line: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        obj_mesh(tmp_path, SQUARE + f"f 1 2 3 4\ng hem\n{line}\n")
+
+
 def test_materials_name_surfaces_beside_objects(tmp_path: Path) -> None:
     text = "o Shirt\n" + SQUARE + "usemtl heavy denim\nf 1 2 3\ng collar\nusemtl cotton\nf 1 3 4\n"
     groups = obj_mesh(tmp_path, text).groups
