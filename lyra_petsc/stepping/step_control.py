@@ -12,7 +12,10 @@ ROUND_OFF = 1e-9
 """Fraction of Δt by which times differ that are computed in different ways."""
 
 SLACK = 1e-6
-"""Fraction of Δt by which a step may be longer to avoid an extra tiny one."""
+"""Fraction of Δt by which a step may be longer to avoid an extra tiny one, and times count as one."""
+
+LEAST_REST = 0.1
+"""Fraction of Δt below which no step is left over before a time on which one must end."""
 
 GROW_AFTER = 2
 """Successful steps after which a shortened Δt is doubled."""
@@ -46,7 +49,7 @@ class StepControl:
     every : float or None
         States are written at multiples of this time [s]; None: at every step.
     events : iterable of float
-        Further times [s] on which a step must end.
+        Further times [s] on which a step must end; of two that count as one, the first is kept.
     smallest : float
         Smallest Δt [s] of a retry.
 
@@ -64,7 +67,9 @@ class StepControl:
         self, step: float, end: float, every: float | None, events: Iterable[float], smallest: float
     ) -> None:
         self.step, self.end, self._every, self.smallest = step, end, every, smallest
-        self._events = sorted({t for t in events if 0.0 < t < end} | {end})
+        self._events = [end]
+        for time in events:
+            self.add_event(time)
         self.factor = 1.0
         self.successes, self.patience = 0, GROW_AFTER
 
@@ -72,7 +77,8 @@ class StepControl:
         """End of the step that starts at ``time`` [s]."""
         dt = self.step * self.factor
         event, state = self._next_event(time), self._next_state(time)
-        target = event if event <= state + ROUND_OFF * dt else self._rounded(state)
+        same = SLACK * min(self.step, self._every or self.step)
+        target = event if event <= state + same else self._rounded(state)
         # end exactly at the event even if it is a round-off error beyond the step
         if target - time <= dt * (1.0 + SLACK):
             return target
@@ -89,8 +95,11 @@ class StepControl:
         return multiple if abs(multiple - time) <= ROUND_OFF * dt else time
 
     def add_event(self, time: float) -> None:
-        """Let a step end at a further time [s]."""
-        bisect.insort(self._events, time)
+        """Let a step end at a further time [s], unless one does already."""
+        place = bisect.bisect_left(self._events, time)
+        near = self._events[max(place - 1, 0) : place + 1]
+        if 0.0 < time < self.end and all(abs(time - event) > SLACK * self.step for event in near):
+            self._events.insert(place, time)
 
     def planned_steps(self) -> int:
         """Number of steps to the end, all of the full Δt but for those cut to end at states and events."""
@@ -100,7 +109,7 @@ class StepControl:
 
     def _partial_step(self, dt: float, remaining: float) -> float:
         """Length [s] of a step of at most dt that ends before the next target, ``remaining`` [s] ahead."""
-        return dt
+        return 0.5 * remaining if remaining < (1.0 + LEAST_REST) * dt else dt
 
     def _next_event(self, time: float) -> float:
         index = bisect.bisect_right(self._events, time + SLACK * self.smallest)

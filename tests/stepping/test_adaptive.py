@@ -152,6 +152,23 @@ def test_round_off_of_the_time_causes_no_tiny_step() -> None:
     assert control.next_end(0.1 - 1e-9) == pytest.approx(0.2 - 1e-9, abs=1e-15)
 
 
+def test_no_tiny_step_is_left_between_times_on_which_steps_end() -> None:
+    """Of frames in single precision beside states, and of frames at 29.97 Hz."""
+    for frames, every, least in (
+        (np.arange(1, 30, dtype=np.float32) * np.float32(0.03), 0.03, 0.99),
+        (np.arange(1, 300) / 29.97, None, 0.1),
+        ([0.5, 0.5 + 1e-9, 0.7], 0.5 - 1e-9, 0.99),
+    ):
+        control, ends = StepControl(0.01, 10.0, every, map(float, frames), 1e-6), [0.0]
+        while ends[-1] < 0.9:
+            ends.append(control.next_end(ends[-1]))
+        assert np.diff(ends).min() > least * 0.01
+        assert np.diff(ends).max() < 1.0001 * 0.01
+        for frame in frames:
+            assert frame > 0.9 or np.abs(np.array(ends) - frame).min() < 1e-8
+        assert every is None or sum(map(control.writes_at, ends)) == int(0.9 / every + 1e-5) + 1
+
+
 @pytest.mark.parametrize("every", [None, 0.04, 0.1, 0.03, 2.0])
 @pytest.mark.parametrize("step", [0.01, 0.03, 0.25, 1.0])
 def test_the_planned_number_of_steps_is_that_of_a_run(step: float, every: float | None) -> None:
