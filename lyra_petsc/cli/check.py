@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -20,7 +21,7 @@ from lyra_petsc.mesh.topology import connected_pieces
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.load import default_scene
-from lyra_petsc.scene.schema import Contact, Friction, Obstacle, Scene, coefficients
+from lyra_petsc.scene.schema import Contact, Friction, Handle, Obstacle, Scene, coefficients
 from lyra_petsc.scene.time_curve import curves
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.problem import Problem
@@ -28,6 +29,9 @@ from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.protocols import WritesTable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.units_check import figures
+
+if TYPE_CHECKING:
+    from lyra_petsc.mesh.frame_motion import FrameMotion
 
 LISTED_RANKS = 16
 """Number of ranks up to which all are listed; of more only the extremes are."""
@@ -110,6 +114,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints, tables: list[tuple
         *_sizes(simulation),
         ("active terms", ", ".join(whole.terms)),
         ("handles", str(len(scene.handles))),
+        *_handle_frames(scene),
         *_curves(scene),
         *_creases(simulation),
         *_contact(scene, whole.barrier.gap if whole.barrier else 0.0),
@@ -206,18 +211,30 @@ def _obstacles(scene: Scene, contact: Contact) -> list[tuple[str, str]]:
         if obstacle.motion is not None:
             parts.append(f"moves by {obstacle.motion!r}" if isinstance(obstacle.motion, str) else "moves")
         if obstacle.mesh is not None and obstacle.mesh.frames is not None:
-            parts += _frames(obstacle, scene)
+            from lyra_petsc.mesh.obstacles import surface_motion  # with frames only
+
+            parts += _frames(surface_motion(obstacle), obstacle, scene)
         rows.append((one_line(f"obstacle {name}"), ", ".join([*parts, f"friction {_friction(friction)}"])))
     return rows
 
 
-def _frames(obstacle: Obstacle, scene: Scene) -> list[str]:
-    """What frames do with an obstacle."""
-    from lyra_petsc.mesh.obstacles import surface_motion  # with frames only
+def _handle_frames(scene: Scene) -> list[tuple[str, str]]:
+    """Rows of the plan about handles that move through frames."""
+    rows = []
+    for number, handle in enumerate(scene.handles):
+        if handle.frames is not None:
+            from lyra_petsc.mesh.frame_motion import handle_frames  # with frames only
 
-    motion, step = surface_motion(obstacle), scene.time.step
-    times = motion.frames.times
-    parts = [f"{len(times)} frames from {times[0]:g} to {times[-1]:g} s, {obstacle.interpolation}"]
+            name = f"handle {number}" + (f" {handle.group}" if handle.group else "")
+            rows.append((one_line(name), ", ".join(_frames(handle_frames(handle), handle, scene))))
+    return rows
+
+
+def _frames(motion: FrameMotion, mover: Handle | Obstacle, scene: Scene) -> list[str]:
+    """What frames do with a handle or an obstacle."""
+    times, step = motion.frames.times, scene.time.step
+    parts = [f"{len(times)} frames from {times[0]:g} to {times[-1]:g} s, {mover.interpolation}"]
+    parts += ["repeated"] if motion.repeats else []
     if isinstance(step, float) and step > motion.interval:
         parts.append(f"steps of {step:g} s pass over {step / motion.interval:.3g} frames each")
     return parts

@@ -18,7 +18,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import check_capacity
 from lyra_petsc.mesh.measures import SAME_PLACE, SCALE_RATIO, plane_coordinates
-from lyra_petsc.mesh.mesh import Group, Mesh, NamedSet, Sheet, Source, TriangleSurface
+from lyra_petsc.mesh.mesh import FrameSums, Group, Mesh, NamedSet, Sheet, Source, TriangleSurface
 from lyra_petsc.mesh.readers import first_few
 from lyra_petsc.mesh.select import DIMENSION_NAMES
 from lyra_petsc.mesh.topology import connected_components, connected_pieces, edge_table
@@ -264,20 +264,21 @@ def build_scene_mesh(scene: Scene, report: Callable[[str], None] | None = None) 
             mesh.obstacles[name], notes = _read_surface(source, scene.trusts_meshes, report)
             mesh.notes += [f"obstacle {name}: {note}" for note in notes]
             if obstacle.mesh.frames is not None:
-                mesh.obstacles[name] = _at_start(mesh.obstacles[name], obstacle)
+                frames = _frames_at_start(mesh.obstacles[name], obstacle)
+                mesh.obstacles[name], mesh.frames[f"obstacles.{name}.mesh.frames"] = frames
     return mesh
 
 
-def _at_start(surface: TriangleSurface, obstacle: Obstacle) -> TriangleSurface:
-    """The surface of an obstacle as its frames have it at t = 0; all frames are checked."""
+def _frames_at_start(surface: TriangleSurface, obstacle: Obstacle) -> tuple[TriangleSurface, FrameSums]:
+    """The surface of an obstacle as its frames have it at t = 0; and what the frames are, all checked."""
     from lyra_petsc.mesh.frame_files import check_frames  # with frames only
     from lyra_petsc.mesh.obstacles import surface_motion
 
     assert obstacle.mesh is not None
     motion = surface_motion(obstacle)
     of = f"{obstacle.mesh.file.name}, of which it holds places, has"
-    check_frames(motion.frames, (len(surface.points),), of)
-    return surface._replace(points=motion.positions(0.0))
+    sums = check_frames(motion.frames, (len(surface.points),), of)
+    return surface._replace(points=motion.positions(0.0)), sums
 
 
 def _read_surface(

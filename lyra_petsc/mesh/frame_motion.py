@@ -39,6 +39,7 @@ class FrameMotion:
     Attributes
     ----------
     frames : FrameFile
+    repeats : bool
     """
 
     def __init__(
@@ -52,8 +53,8 @@ class FrameMotion:
         self.frames, self._chosen = frames, chosen
         self._linear, self._monotone = interpolation == "linear", interpolation == "monotone"
         self._kept: dict[int, Array] = {}
-        times, self._repeats = frames.times, repeat and len(frames.times) > 1
-        if self._repeats:
+        times, self.repeats = frames.times, repeat and len(frames.times) > 1
+        if self.repeats:
             if self._is_closed():
                 times = times[:-1]
                 end = frames.times[-1]
@@ -62,7 +63,7 @@ class FrameMotion:
         else:
             end = times[-1]
         self._n, self._period = len(times), float(end - times[0])
-        self._times = np.append(times, end) if self._repeats else times
+        self._times = np.append(times, end) if self.repeats else times
 
     def _is_closed(self) -> bool:
         first, last = self.frames.read(0), self.frames.read(len(self.frames.times) - 1)
@@ -70,7 +71,7 @@ class FrameMotion:
 
     def _time(self, number: int) -> float:
         """Time [s] of a frame, where those of later cycles are counted on."""
-        if not self._repeats:
+        if not self.repeats:
             return float(self._times[number])
         cycle, frame = divmod(number, self._n)
         return float(self._times[frame]) + cycle * self._period
@@ -91,7 +92,7 @@ class FrameMotion:
 
     def _tangent(self, number: int) -> Array | float:
         """Rates (n, 3) [m/s] at a frame: of a smooth motion, which begins and ends at rest."""
-        if number == 0 or (number == self._n - 1 and not self._repeats):
+        if number == 0 or (number == self._n - 1 and not self.repeats):
             return 0.0
         before, here, after = (self._frame(number + one) for one in (-1, 0, 1))
         t0, t1, t2 = (self._time(number + one) for one in (-1, 0, 1))
@@ -109,7 +110,7 @@ class FrameMotion:
         if time <= times[0] or len(times) == 1:
             return 0, 0.0, 0.0
         cycle = 0
-        if self._repeats:
+        if self.repeats:
             cycle = int((time - times[0]) // self._period)
             time -= cycle * self._period
         elif time >= times[-1]:
@@ -151,7 +152,7 @@ class FrameMotion:
             return []
         times, cycle = self._times[: self._n], 0
         out: list[float] = []
-        while not out or (self._repeats and out[-1] < end):
+        while not out or (self.repeats and out[-1] < end):
             out += (times + cycle * self._period).tolist()
             cycle += 1
         return [t for t in out if t < end]

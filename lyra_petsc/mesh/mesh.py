@@ -41,6 +41,13 @@ class Source:
     n_triangles: int
 
 
+class FrameSums(NamedTuple):
+    """Times (T,) float64 [s] of frames, and check sums (T,) int64 of their positions."""
+
+    time: Array
+    sums: Ints
+
+
 class TriangleSurface(NamedTuple):
     """Points (n, 3) float64 [m], and triangles (m, 3) int64 as indices of points."""
 
@@ -79,6 +86,8 @@ class Mesh:
         Node tags of .msh files, 0 for other sources; None if all tags are 1, 2, 3, ….
     obstacles : dict of str to TriangleSurface
         Obstacles of the scene that are meshes, at t = 0; not part of the sheets.
+    frames : dict of str to FrameSums
+        What frames of obstacles and handles were, by their keys.
     coincident : (n, 2) int64
         Vertices of one source that coincide at the start without being connected: each with the lowest one
         there.
@@ -99,6 +108,7 @@ class Mesh:
     sources: list[Source] = field(default_factory=list)
     tags: Ints | None = None
     obstacles: dict[str, TriangleSurface] = field(default_factory=dict)
+    frames: dict[str, FrameSums] = field(default_factory=dict)
     coincident: Ints = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
     tied: Ints = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
     unconnected: str = ""

@@ -14,6 +14,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.output.checkpoint import Checkpoint, TermArrays
 from lyra_petsc.output.file_operations import reason
 from lyra_petsc.output.hdf5 import read_slab
+from lyra_petsc.output.mesh_file import frame_changes
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.stored import open_stored, read_stored
 from lyra_petsc.output.xdmf import group_name
@@ -172,6 +173,8 @@ def note_changes(simulation: SteppedScene, before: Path) -> tuple[list[Change], 
             earlier = on_root(comm, lambda: obstacle_motions(load_scene(before, meshes_needed=False)))
             now = obstacle_motions(scene)
             earlier_motions = {n: motion for n, motion in earlier.items() if n in now and motion != now[n]}
+    frames = on_root(comm, lambda: frame_changes(before.parent, simulation.problem.mesh))
+    notes += [f"changed since the run was begun: {text}" for text in frames]
     for change in changes:
         if change.key == "time.end":
             notes.append(str(change))

@@ -36,7 +36,8 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
     ``/groups/<number>`` with an attribute ``name`` and its non-empty arrays ``vertices`` (n,),
     ``edges`` (k, 2) and ``triangles`` (m,); for each obstacle that is a mesh ``/obstacles/<number>``
     with an attribute ``name``, ``points`` (n, 3) [m] at t = 0 and ``triangles`` (m, 3).
-    Lengths have an attribute ``units``.
+    Frames have groups ``/frames/<number>`` with an attribute ``key``, ``time`` (T,) [s] and check sums
+    ``sums`` (T,). Lengths have an attribute ``units``.
 
     Parameters
     ----------
@@ -64,10 +65,13 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
         for number, (name, surface) in enumerate(mesh.obstacles.items()):
             names[f"obstacles/{number}"] = {"name": name}
             datasets |= {f"obstacles/{number}/{part}": rows for part, rows in surface._asdict().items()}
+        for number, (key, frames) in enumerate(mesh.frames.items()):
+            names[f"frames/{number}"] = {"key": key}
+            datasets |= {f"frames/{number}/{part}": rows for part, rows in frames._asdict().items()}
         names |= {name: {SUM: np.uint64(check_sum(rows))} for name, rows in datasets.items()}
         for name, rows in datasets.items():
-            if rows.dtype.kind == "f":  # all but numbers of vertices and triangles are lengths
-                names[name]["units"] = "m"
+            if rows.dtype.kind == "f":  # the others are numbers of vertices and triangles, and sums
+                names[name]["units"] = "s" if name.endswith("time") else "m"
         create_file(Path(folder) / MESH_FILE, datasets, names)
 
     on_root(comm, work)
@@ -122,6 +126,27 @@ def check_same_mesh(
             )
 
     on_root(comm, work)
+
+
+def frame_changes(folder: str | os.PathLike[str], mesh: Mesh | None) -> list[str]:
+    """Texts on the frames of a scene that are others than when the run was begun; call on rank 0.
+
+    Raises
+    ------
+    InputError
+        If ``mesh.h5`` cannot be read.
+    """
+    assert mesh is not None
+    stored, texts = StoredMesh(Path(folder)).frames if mesh.frames else {}, []
+    for key in stored.keys() & mesh.frames.keys():
+        (times, sums), (times_now, sums_now) = stored[key], mesh.frames[key]
+        common = min(len(times), len(times_now))
+        differs = (times[:common] != times_now[:common]) | (sums[:common] != sums_now[:common])
+        first = int(np.argmax(differs)) if differs.any() else common
+        if first < max(len(times), len(times_now)):
+            longer = times if first >= len(times_now) else times_now
+            texts.append(f"{key}: other frames from number {first} (t = {longer[first]:g} s) on")
+    return sorted(texts)
 
 
 def _arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:

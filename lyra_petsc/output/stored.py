@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, LyraError
-from lyra_petsc.mesh.mesh import Group, TriangleSurface
+from lyra_petsc.mesh.mesh import FrameSums, Group, TriangleSurface
 from lyra_petsc.output.file_operations import reason
 from lyra_petsc.output.layout import MESH_FILE, RESULT, STATE_FILE
 from lyra_petsc.output.xdmf import StoredField, WrittenState, group_name
@@ -370,6 +370,17 @@ class StoredMesh:
             triangles = self._indices(f"obstacles/{number}/triangles", (None, 3), len(points))
             surfaces[name] = TriangleSurface(points, triangles)
         return surfaces
+
+    @property
+    def frames(self) -> dict[str, FrameSums]:
+        """What frames of obstacles and handles were when the run was begun, by their keys."""
+        with open_stored(self.path) as file:
+            keys = {number: group.attrs["key"].decode() for number, group in file.get("frames", {}).items()}
+        sums = {}
+        for number, key in keys.items():
+            time = read_stored(self.path, f"frames/{number}/time", (None,), "f")
+            sums[key] = FrameSums(time, read_stored(self.path, f"frames/{number}/sums", (len(time),), "i"))
+        return sums
 
     def _indices(self, dataset: str, shape: tuple[int | None, ...], end: int) -> Ints:
         """A dataset of indices from 0 to ``end`` − 1."""

@@ -577,7 +577,7 @@ def _handle_frames(scene: Scene, part: LocalMesh) -> dict[int, HandleFrames]:
 
 
 def _check_handle_frames(scene: Scene, mesh: Mesh, held: Selection) -> None:
-    """Refuse frames of handles that cannot be used (rank 0)."""
+    """Refuse frames of handles that cannot be used, and keep in the mesh what they are (rank 0)."""
     for number, vertices in held.items():
         handle = scene.handles[number]
         if handle.frames is not None:
@@ -585,7 +585,8 @@ def _check_handle_frames(scene: Scene, mesh: Mesh, held: Selection) -> None:
             from lyra_petsc.mesh.frame_motion import handle_frames
 
             counts = len(vertices), mesh.n_vertices
-            check_frames(handle_frames(handle).frames, counts, f"handles[{number}] or the mesh has")
+            key, frames = f"handles[{number}].frames", handle_frames(handle).frames
+            mesh.frames[key] = check_frames(frames, counts, f"handles[{number}] or the mesh has")
 
 
 def _clamped_edges(scene: Scene, part: LocalMesh, terms: Mapping[str, Term]) -> ClampedEdges | None:

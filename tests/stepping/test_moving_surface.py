@@ -11,9 +11,13 @@ from mpi4py import MPI
 from physics import grid
 
 from lyra_petsc.api.simulations import Simulation
-from lyra_petsc.mesh.obstacles import BOX_TRIANGLES
+from lyra_petsc.mesh.obstacles import BOX_TRIANGLES, surface_motion
+from lyra_petsc.scene.schema import Obstacle
 
 pytestmark = pytest.mark.parallel
+
+RING = 0.8 / 6 * np.arange(7)
+"""Heights [m] of the vertices along an edge."""
 
 CORNERS = np.array([[x, y, z] for z in (-0.1, 0.0) for y in (-0.3, 0.3) for x in (-0.3, 0.3)])
 TIMES = [0.0, 0.05, 0.1, 0.2]
@@ -67,6 +71,81 @@ def test_a_translation_by_frames_is_that_by_keyframes(
     by_frames = final(comm, scene(shared_tmp, integrator, frames=str(shared_tmp / "walk.npz")))
     assert np.abs(by_keyframes[:, 0]).max() > 0.4
     assert np.abs(by_frames - by_keyframes).max() < 1e-6
+
+
+@pytest.mark.parametrize("repeat", [False, True])
+def test_a_rotation_by_frames_has_its_places_where_steps_end(
+    comm: MPI.Comm, shared_tmp: Path, repeat: bool
+) -> None:
+    """Of a handle in the run, and of a body; frames at 29.97 Hz leave no tiny steps."""
+    times, angles = np.arange(5) / 29.97, np.radians([0.0, 20.0, 60.0, 50.0, 0.0])
+    turns = np.zeros((5, 3, 3))
+    turns[:, 1, 1] = 1.0
+    turns[:, 0, 0] = turns[:, 2, 2] = np.cos(angles)
+    turns[:, 0, 2], turns[:, 2, 0] = np.sin(angles), -np.sin(angles)
+    left = np.stack([0 * RING, RING, 0 * RING + 0.5], axis=1)
+    if comm.rank == 0:
+        write(shared_tmp)
+        for name, points in (("turn.npz", CORNERS), ("pins.npz", left)):
+            np.savez(shared_tmp / name, time=times, position=points @ turns.transpose(0, 2, 1))
+    comm.barrier()
+    frames = {"interpolation": "linear", "repeat": repeat}
+    content: dict[str, Any] = {
+        "mesh": grid(0.8, 0.8, 6, 6) | {"transform": {"translate": [0, 0, 0.5]}},
+        "material": {"cloth": "gray-interlock", "damping": 0.02},
+        "handles": [{"group": "left", "frames": str(shared_tmp / "pins.npz")} | frames, {"group": "right"}],
+        "time": {"end": 0.2, "step": 0.01},
+    }
+    ends, seen = [0.0], 0
+    with Simulation(content, comm=comm) as simulation:
+        for step in simulation:
+            ends.append(step.time)
+            at = step.time % times[-1] if repeat else min(step.time, times[-1])
+            frame = int(np.argmin(np.abs(np.append(times[:-1], times[-1]) - at)))
+            positions = comm.bcast(simulation.gather(step.positions))
+            if abs(times[frame] - at) < 1e-12:
+                assert np.abs(positions[7 * np.arange(7)] - left @ turns[frame].T).max() < 1e-9
+                seen += 1
+    assert seen >= 5
+    assert np.diff(ends).min() > 1e-3
+    box = {"mesh": {"file": str(shared_tmp / "box.obj"), "frames": str(shared_tmp / "turn.npz")}}
+    motion = surface_motion(Obstacle.model_validate(box | {"interpolation": "linear"}))
+    for time, turn in zip(times, turns, strict=True):
+        assert np.abs(motion.positions(time) - CORNERS @ turn.T).max() < 1e-9
+
+
+@pytest.mark.parametrize("interpolation", ["monotone", "hermite", "linear"])
+@pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
+def test_a_ring_pulled_by_frames_moves_as_by_keyframes(
+    comm: MPI.Comm, shared_tmp: Path, integrator: str, interpolation: str
+) -> None:
+    """All along the edge of a sheet."""
+    # the rates that monotone limits are those of scale and shift apart, or of the sum
+    scales = (1.0, 1.0, 1.0, 1.0) if interpolation == "monotone" else (1.0, 1.02, 0.98, 1.1)
+    ring = sorted(set(np.flatnonzero([k % 7 in (0, 6) or k // 7 in (0, 6) for k in range(49)]).tolist()))
+    keyframes = [
+        {"time": time, "translate": shift, "scale": scale}
+        for time, shift, scale in zip(TIMES, SHIFTS, scales, strict=True)
+    ]
+    pull = {"nodes": ring, "interpolation": interpolation}
+    content: dict[str, Any] = {
+        "mesh": grid(0.8, 0.8, 6, 6),
+        "material": {"cloth": "gray-interlock", "damping": 0.02},
+        "handles": [pull | {"motion": "pull"}],
+        "motions": {"pull": keyframes},
+        "gravity": [0, 0, -9.81],
+        "time": {"end": 0.2, "step": 0.01, "integrator": integrator},
+        "solver": {"force_tolerance": 1e-12},
+    }
+    by_keyframes = final(comm, content)
+    if comm.rank == 0:
+        places = np.stack([np.array(ring) % 7, np.array(ring) // 7, 0 * np.array(ring)], axis=1) * (0.8 / 6)
+        position = np.array(scales)[:, None, None] * places + np.array(SHIFTS)[:, None]
+        np.savez(shared_tmp / "pins.npz", time=TIMES, position=position)
+    comm.barrier()
+    by_frames = final(comm, content | {"handles": [pull | {"frames": str(shared_tmp / "pins.npz")}]})
+    assert np.abs(by_keyframes[:, 2]).max() > 0.01
+    assert np.abs(by_frames - by_keyframes).max() < 1e-9
 
 
 @pytest.mark.parametrize("whole", [False, True])
