@@ -20,6 +20,7 @@ from lyra_petsc.mesh.obstacles import (
     box_corners,
     build_obstacles,
 )
+from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.output.layout import MESH_FILE, SUMMARY_FILE
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.schema import Keyframe, Obstacle
@@ -78,6 +79,11 @@ PLANE_SIZE = 1.5
 """Side of the square that represents a plane, relative to the size of the sheets' motion."""
 OPACITY = 0.3
 """Opacity of planes and containers, which would hide the sheets."""
+
+SHARP, SHARP_PART = 50.0, 0.01
+"""Angle [°] between two triangles from which their edge is sharp; and part of such edges in a mesh from which
+it is no smooth surface.
+"""
 
 _SQUARE: Ints = np.array([[0, 1, 2], [0, 2, 3]])
 _AXES = np.eye(3)
@@ -143,14 +149,25 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
         if spec.mesh is not None:
             assert isinstance(obstacle, Solid)
             surface = TriangleSurface(obstacle.points, obstacle.triangles)
+            smooth = is_smooth(surface)
         else:
-            surface = shape_surface(spec)
+            surface, smooth = shape_surface(spec), spec.shape in ("sphere", "capsule")
         positions = partial(_moved_points, obstacle, surface.points)
-        opacity, smooth = OPACITY if spec.inside else 1.0, spec.shape in ("sphere", "capsule")
+        opacity = OPACITY if spec.inside else 1.0
         surfaces.append(
             ObstacleSurface(obstacle.name, surface.triangles, positions, fixed, False, opacity, smooth)
         )
     return surfaces
+
+
+def is_smooth(surface: TriangleSurface) -> bool:
+    """Whether triangles approximate a smooth surface: nearly none meet at a sharp edge."""
+    a, b, c = surface.points[surface.triangles.T]
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    first, second = normals[hinges(surface.triangles).triangles].transpose(1, 0, 2)
+    sharp = np.einsum("ei,ei->e", first, second) < np.cos(np.radians(SHARP))
+    return bool(np.count_nonzero(sharp) < SHARP_PART * len(sharp))
 
 
 def _moved_points(obstacle: Solid | Container, points: Array, time: float) -> Array:

@@ -9,9 +9,15 @@ import numpy as np
 import pytest
 from written_run import written_with_obstacles
 
+from lyra_petsc.mesh.mesh import TriangleSurface
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.schema import Obstacle
-from lyra_petsc.show.obstacle_surfaces import ObstacleSurface, obstacle_surfaces, shape_surface
+from lyra_petsc.show.obstacle_surfaces import (
+    ObstacleSurface,
+    is_smooth,
+    obstacle_surfaces,
+    shape_surface,
+)
 
 pytestmark = pytest.mark.quick
 
@@ -40,6 +46,14 @@ def test_shapes_are_closed_and_face_outwards(shape: dict[str, Any], volume: floa
         part = np.clip((x - start) @ (to - start) / ((to - start) @ (to - start)), 0, 1)
         away = np.linalg.norm(x - start - part[:, None] * (to - start), axis=1)
         np.testing.assert_allclose(away, shape["capsule"]["radius"], rtol=1e-12)
+
+
+def test_a_mesh_is_drawn_smooth_unless_it_has_edges() -> None:
+    ball = shape_surface(Obstacle.model_validate({"sphere": {"center": [0, 0, 0], "radius": 1}}))
+    box = shape_surface(Obstacle.model_validate({"box": {"min": [0, 0, 0], "max": [1, 1, 1]}}))
+    assert is_smooth(ball)
+    assert not is_smooth(box)
+    assert not is_smooth(TriangleSurface(np.eye(3), np.array([[0, 1, 2]])))
 
 
 def shown(folder: Path, obstacle: dict[str, Any], middle: list[float], size: float) -> ObstacleSurface:
