@@ -69,6 +69,12 @@ ENTRIES = {
     "cushion": Entry(1.0, ("--colors", "#7d3c74,#f0d49a"), speed=0.4),
     "balloon": Entry(1.0, ("--handles",), speed=0.2),
     "miura": Entry(0.7, ("--colors", "#eee9dc,#c9a86a"), speed=0.2),
+    "skirt": Entry(
+        2.2,
+        ("--colors", "#7d3c74,#f0d49a"),
+        ("mesh.size=0.0098", "contact.gap=0.003", "output.every=0.02"),
+        speed=0.6,
+    ),
     "crease": Entry(2.5, ("--field", "plastic_curvature"), speed=0.5),
 }
 

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """Makes a mannequin, an obstacle for garments: body.obj at rest, and walk.npz, in which it walks on the spot.
 
-    python scripts/mannequin.py FOLDER [--triangles 20000] [--frames 120] [--fps 30]
+    python scripts/mannequin.py FOLDER [--triangles 20000] [--frames 120] [--fps 30] [--wait 0]
 
 It needs numpy and the extra `view`. The body is the surface at a distance from bones, blended between them;
 z is up, it looks along y, and its arms hang away from its sides. Frame 0 is the body at rest, from which
-the walk begins smoothly. Vertices turn with the bones near them (linear blend skinning, as in N. Magnenat-
-Thalmann, R. Laperrière, D. Thalmann, Graphics Interface 1988).
+the walk begins smoothly after it has waited. Vertices turn with the bones near them (linear blend skinning,
+as in N. Magnenat-Thalmann, R. Laperrière, D. Thalmann, Graphics Interface 1988).
 """
 
 from __future__ import annotations
@@ -184,6 +184,7 @@ def main() -> None:
     parser.add_argument("--triangles", type=int, default=20_000)
     parser.add_argument("--frames", type=int, default=120)
     parser.add_argument("--fps", type=float, default=30.0)
+    parser.add_argument("--wait", type=float, default=0.0, help="time of frame 0 [s]")
     chosen = parser.parse_args()
     spacing = 0.02
     for _ in range(2):  # the number of triangles goes with the square of the spacing
@@ -196,7 +197,7 @@ def main() -> None:
     lines = ["v {:.7f} {:.7f} {:.7f}".format(*point) for point in positions[0]]
     lines += ["f {} {} {}".format(*corners) for corners in triangles + 1]
     (chosen.folder / "body.obj").write_text("\n".join(lines) + "\n")
-    np.savez(chosen.folder / "walk.npz", time=times, position=positions)
+    np.savez(chosen.folder / "walk.npz", time=chosen.wait + times, position=positions.astype(np.float32))
     print(f"{chosen.folder}: body.obj with {len(triangles)} triangles, walk.npz with {len(times)} frames")
 
 

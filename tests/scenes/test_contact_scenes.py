@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
+from physics import direct_solver, options
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.arrays import Array
-from lyra_petsc.cli.check_run import crossings_of
+from lyra_petsc.cli.check_run import crossings_of, run_ties
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.scene.load import load_scene
@@ -31,7 +32,7 @@ def run_of(comm: MPI.Comm, folder: Path, name: str, *settings: str) -> StoredRun
     run = StoredRun(folder / "run")
     obstacles = run_obstacles(run)
     for state in range(len(run)):
-        pairs, at_corners, overlaps = crossings_of(run, obstacles, state)
+        pairs, at_corners, overlaps = crossings_of(run, obstacles, state, tied=run_ties(run))
         inside = [part for overlap in overlaps.values() for part in overlap]
         assert not any(len(found) for found in (pairs, at_corners, *inside))
     assert np.median(np.asarray(run.history["newton_iterations"])[1:]) <= 20
@@ -117,3 +118,19 @@ def test_a_reef_knot_holds(comm: MPI.Comm, shared_tmp: Path) -> None:
     # from bight to bight; steps of 10 and 5 ms: 0.0644, 0.0722
     x, left = run.positions[-1], run.rest[:, 1] < 0.5
     assert x[left, 0].max() - x[~left, 0].min() == pytest.approx(0.068, abs=6e-3)
+
+
+def test_a_skirt_is_sewn_and_worn(comm: MPI.Comm, shared_tmp: Path) -> None:
+    settings = "mesh.size=0.08", "time.step=0.04", "time.end=1.12", "output.every=0.04"
+    with options(direct_solver(comm)):
+        run = run_of(comm, shared_tmp, "skirt", *settings)
+    if run is None:
+        return
+    waist, hem = (column(run.probes, f"{name}_z") for name in ("waist", "hem"))
+    # the waist rests on the hips, which are wider below; the weight begins to act at 0.7 s
+    assert waist[-1] == pytest.approx(1.0898, abs=1e-3)
+    assert hem[-1] == pytest.approx(0.6030, abs=1e-3)
+    assert waist[0] > waist[-1] + 0.01
+    gap = column(run.seams, "gap")
+    assert gap[0] == pytest.approx(0.3)
+    assert gap[-2:].max() < 1e-5
