@@ -121,12 +121,6 @@ class ActiveTerms:
         """The data with moving targets and springs at their positions at ``step.target_time``."""
         return {**frozen, **{term: term.freeze(step) for term in (*self.moving, *self.external)}}
 
-    def moving_energy(self, x: Array, frozen: Frozen) -> float:
-        """Energy [J] of this rank's terms with moving targets that are not stiff, without obstacles, at these
-        targets.
-        """
-        return sum(float(t.energies(x, frozen[t]).sum()) for t in self.targets if not t.is_stiff)
-
     def limits_act(self, x: Array, frozen: Frozen, layout: Layout) -> bool:
         """Whether any term that limits steps acts at positions x (n_local, 3): its forces change too abruptly
         for one linear solve; or whether parts that one holds together are apart; collective.

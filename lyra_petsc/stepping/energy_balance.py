@@ -1,7 +1,13 @@
-"""Energies of the state and works of the steps, as in the energy identity of backward Euler::
+"""Energies of the state and works of the steps.
 
-Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt vᵀ D v + bracket + work of handles and loads
-bracket = E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx   (≤ 0 where E is convex)
+Every work is a force times a displacement, with the force in the middle of the step. Moving targets, or the
+gas in a volume, work by the forces on them, ∂E/∂λ, and the change Δλ of their places, or of its amount: these
+forces, and those of moving obstacles, are the means of both ends. Forces of handles, loads and dampers are
+known at the stage of a step: those in its middle are in line with this stage and the last one. With an
+integrator of first order they are those at the stage, for which backward Euler has the identity::
+
+    Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt vᵀ D v + bracket + work of handles, loads and targets
+    bracket = E(x_{n+1}, λ_{n+1}) − E(x_n, λ_n) − ∂E/∂x·Δx − ∂E/∂λ·Δλ at n + 1   (≤ 0 where E is convex)
 """
 
 from __future__ import annotations
@@ -19,8 +25,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import kinetic_energy
 from lyra_petsc.stepping.time_step import Evaluation
 from lyra_petsc.terms.energies import ENERGIES
-from lyra_petsc.terms.protocols import Dissipates, GlobalSums, MovingTargets, PullsHandles
-from lyra_petsc.terms.term import Load
+from lyra_petsc.terms.protocols import Dissipates, MovingTargets, PullsHandles
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
 
@@ -64,32 +69,25 @@ class StepAccount:
     ----------
     before, after : Budget
         At both ends of the step.
-    moving_before, moving : float
-        Energies of the terms with moving targets at both ends.
-    external, obstacle_work : float
-        Work of handles, springs and loads without a potential; the part of it by moving obstacles.
-    obstacle_work_at_start : float
-        The latter by the forces of contact at the start of the step.
+    external : float
+        Work of handles, springs, loads without a potential, moving targets and obstacles.
+    moved_at_start, moved : float
+        The part of targets and obstacles, by the forces at the start of the step, and at its end.
     heat, damping_heat, fabric_heat : float
         Heat of all dampers; of material damping, and of friction within the fabric.
     inertia : float
         ½ ‖Δv‖²_M of a step of backward Euler, with the velocities that solve it.
-    early : float
-        What the external work would be more if gas were let in before the sheet moves, as in the identity.
     """
 
     before: Budget
     after: Budget
-    moving_before: float
-    moving: float
     external: float
-    obstacle_work: float
-    obstacle_work_at_start: float
+    moved_at_start: float
+    moved: float
     heat: float
     damping_heat: float
     fabric_heat: float
     inertia: float
-    early: float = 0.0
 
     @property
     def change(self) -> float:
@@ -98,8 +96,10 @@ class StepAccount:
 
     @property
     def bracket(self) -> float:
-        """The bracket of backward Euler's identity: what works, heat and ½ ‖Δv‖²_M leave of the change."""
-        return self.change + self.heat - self.external - self.early + self.inertia
+        """The bracket of backward Euler's identity: what works by the forces at the end, heat and
+        ½ ‖Δv‖²_M leave of the change."""
+        by_end = self.external + 0.5 * (self.moved - self.moved_at_start)
+        return self.change + self.heat - by_end + self.inertia
 
 
 def _work_of(force: Array, x_before: Array, x: Array) -> float:
@@ -108,74 +108,52 @@ def _work_of(force: Array, x_before: Array, x: Array) -> float:
     return sum(float(np.vdot(force[rows], x[rows] - x_before[rows])) for rows in parts)
 
 
-def varying_force(equations: StageEquations, x: Array, v: Array, time: float) -> Array:
-    """Force (n_local, 3) [N] of the loads that change in time at a time [s] of the step, with positions and
-    velocities x, v (n_local, 3).
+@dataclass(frozen=True, eq=False)
+class WorkingForces:
+    """Forces at the stage of a step.
+
+    Attributes
+    ----------
+    work, heat : (n_owned, 3)
+        Force [N] of handles, springs, friction and loads without a potential; force of material damping.
+    ahead : float
+        Time [s] from the stage to the end of the step.
     """
-    step, force = equations.targets_at(time, x), np.zeros_like(x)
-    for term in equations.active.varying:
-        if isinstance(term, Load):
-            term.add_force(step, force)
-        else:
-            term.add_gradient(v, term.freeze(step), against := np.zeros_like(x))
-            force -= against
-    return force
+
+    work: Array
+    heat: Array
+    ahead: float
+
+    def at_middle(self, dt: float, last: WorkingForces) -> WorkingForces:
+        """Forces in the middle of a step of dt [s], in line with those of the ``last`` one."""
+        part = (0.5 * dt + last.ahead) / (dt - self.ahead + last.ahead)
+        work, heat = (
+            part * now + (1.0 - part) * before
+            for now, before in ((self.work, last.work), (self.heat, last.heat))
+        )
+        return WorkingForces(work, heat, 0.5 * dt)
 
 
-def _work_besides_stage(equations: StageEquations, x_before: Array) -> float:
-    """Work [J] of the loads that change in time, in the step from x_before (n_owned, 3) [m], by the mean of
-    both ends less that by their values at the stage, which backward Euler's identity has.
-    """
-    step, at = equations.step, equations.evaluated
-    if not equations.active.varying or equations.integrator.order == 1:
-        return 0.0
-    start, end, stage = (
-        varying_force(equations, at.x, at.v, t) for t in (step.start, step.end, step.at_stage)
-    )
-    moved = equations.x[: len(x_before)] - x_before
-    more = (0.5 * (start + end) - stage)[: len(moved)]
-    return float(np.vdot(more, np.where(step.prescribed.free, moved, 0.0)))
-
-
-def _obstacle_works(equations: StageEquations, x_before: Array) -> tuple[float, float]:
-    """Work [J] of contact from outside on this rank's elements in the step from x_before (n_owned, 3): of the
-    impulses at its end, and of moving obstacles by their forces at its start, or at its end.
+def _moved_works(equations: StageEquations, x_before: Array) -> tuple[float, float, float]:
+    """Of this rank's moving targets and obstacles in the step from x_before (n_owned, 3): the energy of
+    targets at its start, and the works [J] by the forces at its start and at its end.
     """
     step, impulses = equations.step, equations.contact_end.impulses.work
-    at_start = at_end = impulses
-    for term in equations.active.obstacles if step.in_contact else ():
-        x = equations.points.extended(x_before)
+    stored, at_start, at_end = 0.0, impulses, impulses
+    targets, obstacles = equations.active.targets, equations.active.obstacles if step.in_contact else ()
+    if not (targets or obstacles):
+        return stored, at_start, at_end
+    x, x_at_end = equations.points.extended(x_before), equations.x
+    for term in targets:
+        start, end = (term.freeze(equations.targets_at(at)) for at in (step.start, step.end))
+        stored += float(term.energies(x, start).sum())
+        (before, pull), (after, pull_at_end) = term.targets(x, start), term.targets(x_at_end, end)
+        at_start += float(np.vdot(pull, after - before))
+        at_end += float(np.vdot(pull_at_end, after - before))
+    for term in obstacles:
         at_start += term.work(x, step.start, step.start, step.end)
         at_end += term.work(equations.evaluated.x, step.end, step.start, step.end)
-    return at_start, at_end
-
-
-def _move_targets_to_end(equations: StageEquations) -> float:
-    """Put moving targets at the end of the step; the change [J] of the energy of this rank's terms."""
-    step, active = equations.step, equations.active
-    if step.ends_at_stage or not (active.moving or active.external):
-        return 0.0
-    frozen = active.with_targets(step.frozen, equations.targets_at(step.end))
-    equations.change(frozen=frozen)
-    return active.moving_energy(equations.x, frozen) - active.moving_energy(equations.x, step.frozen)
-
-
-def _early_work(equations: StageEquations) -> float:
-    """What the work on this rank's enclosed volumes is more if gas is let in before and after the sheet
-    moves, up to and from the stage, than if it is let in as the sheet moves (trapezoidal rule).
-
-    The pressure of gas that is let in falls at once as the sheet gives way.
-    """
-    step, terms = equations.step, [t for t in equations.active.targets if isinstance(t, GlobalSums)]
-    early = 0.0
-    for term in terms:
-        start, end = (term.freeze(equations.targets_at(time)) for time in (step.start, step.end))
-        (at_start, before, to_end), (from_start, after, at_end) = (
-            [float(term.energies(x, frozen).sum()) for frozen in (start, step.frozen[term], end)]
-            for x in (step.x, equations.x)
-        )
-        early += before - at_start + at_end - after - 0.5 * (to_end - at_start + at_end - from_start)
-    return early
+    return stored, at_start, at_end
 
 
 class EnergyBalance:
@@ -197,17 +175,12 @@ class EnergyBalance:
         named = dict.fromkeys(term.registration.energy for term in equations.active.elastic)
         self._columns = [name for name in named if name not in (*ENERGIES, "")]
         self._at = equations.step.prescribed.indices
-        self._reactions = self.damping = np.zeros(len(self._at))
-        self._ends: tuple[Array, list[tuple[Array, Array]]] | None = None
+        self._reactions = np.zeros(len(self._at))
+        self._last: WorkingForces | None = None
         if not equations.integrator.dynamic:
             still = np.zeros((equations.points.n_owned, 3))
-            self._ends = (
-                self._external_forces(equations.forces.parts(equations.at(equations.x, equations.v), still))[
-                    0
-                ],
-                self._moving_targets(),
-            )
-        self._stiff = self._moving_targets(stiff=True)
+            at_rest = equations.forces.parts(equations.at(equations.x, equations.v), still)
+            self._last = self._working_forces(at_rest)
         self.budget = Budget()
         self.measure()
 
@@ -242,7 +215,7 @@ class EnergyBalance:
                 energy = float(term.energies(here.x, frozen).sum())
                 energy -= term.heat(here.x, frozen) if isinstance(term, Dissipates) else 0.0
                 energies[name] += energy
-                moving += energy if isinstance(term, MovingTargets) and not term.is_stiff else 0.0
+                moving += energy if isinstance(term, MovingTargets) else 0.0
         for load in equations.active.loads:
             if name := load.registration.energy:
                 energies[name] += load.potential(equations.x)
@@ -256,8 +229,7 @@ class EnergyBalance:
 
     def enter(self, account: StepAccount) -> None:
         """Take the account of a step that is accepted into the books."""
-        self.budget, self._moving_energy = account.after, account.moving
-        self._stiff = self._moving_targets(stiff=True)
+        self.budget, self._moving_energy, self._last = account.after, self._moving_at_end, self._stage
 
     def record(self, x_before: Array) -> None:
         """`enter` the account of the step just taken from x_before (n_owned, 3)."""
@@ -265,93 +237,69 @@ class EnergyBalance:
 
     def account_of(self, x_before: Array) -> StepAccount:
         """The account of the step just taken from x_before (n_owned, 3)."""
-        equations = self._equations
+        equations, step = self._equations, self._equations.step
         move_frames_to_end(equations)
-        external, self.damping, damped = self._external_forces(equations.forces_at_stage())
-        at_start, by_obstacles = _obstacle_works(equations, x_before)
-        by_targets = equations.step.moving_energy + by_obstacles
-        if self._ends is not None:  # the stage of a load step is at its end: take the mean of both ends
-            pull, targets = self._ends
-            self._ends = external, self._moving_targets()
-            external = 0.5 * (external + pull)
-            by_targets = by_obstacles + sum(
-                0.5 * float(np.vdot(pull + pull0, at - at0))
-                for (at0, pull0), (at, pull) in zip(targets, self._ends[1], strict=True)
+        forces = self._working_forces(equations.forces_at_stage())
+        self.damping, self._stage = forces.heat.take(self._at), None
+        if equations.integrator.order > 1 or not equations.integrator.dynamic:
+            self._stage = forces
+            if self._last and not equations.start_acceleration.starts_anew:
+                forces = forces.at_middle(step.dt, self._last)
+        if not step.ends_at_stage and (equations.active.moving or equations.active.external):
+            equations.change(
+                frozen=equations.active.with_targets(step.frozen, equations.targets_at(step.end))
             )
-        early = _early_work(equations) if self._ends is None else 0.0
-        at_stage = self._moving_targets(equations.evaluated.x, stiff=True)
-        by_targets += _move_targets_to_end(equations)
-        if self._ends is None:
-            moved = zip(self._stiff, at_stage, self._moving_targets(stiff=True), strict=True)
-            by_targets += sum(float(np.vdot(pull, at - at0)) for (at0, _), (_, pull), (at, _) in moved)
-        work = _work_of(external, x_before, equations.x) + by_targets
-        work += _work_besides_stage(equations, x_before)
-        del external  # to save memory
         here = equations.here()
         fabric = sum(term.heat(here.x, here.frozen[term]) for term in equations.active.dissipating)
+        inertia = kinetic_energy(equations.mass, equations.evaluated.v[: len(equations.mass)] - step.v_h)
+        works = [_work_of(force, x_before, equations.x) for force in (forces.work, forces.heat)]
+        moved = _moved_works(equations, x_before)
         impacts = equations.contact_end.impulses.heat
-        inertia = kinetic_energy(
-            equations.mass, equations.evaluated.v[: len(equations.mass)] - equations.step.v_h
-        )
-        before, moving_before = self.budget, self._moving_energy
-        local = work, damped, fabric, impacts, by_obstacles, at_start, inertia, early
-        energies, moving, sums = self._measured(here, *local)
-        work, damped, fabric, impacts, by_obstacles, at_start, inertia, early = sums
-        if self._ends is None:  # a handle does work on the sheet through targets that move with it
-            work -= moving_before + early
-        heat = damped + fabric + impacts
+        del forces  # to save memory
+        energies, self._moving_at_end, sums = self._measured(here, *works, *moved, fabric, impacts, inertia)
+        work, damped, stored, at_start, at_end, fabric, impacts, inertia = sums
+        appeared = stored - self._moving_energy  # with targets that begin or cease to act
+        at_start, at_end = at_start + appeared, at_end + appeared
+        work += 0.5 * (at_start + at_end)
+        before, heat = self.budget, damped + fabric + impacts
         after = Budget(
             **energies, external_work=before.external_work + work, dissipation=before.dissipation + heat
         )
-        works = work, by_obstacles, at_start
-        self.account = StepAccount(
-            before, after, moving_before, moving, *works, heat, damped, fabric, inertia, early
-        )
+        self.account = StepAccount(before, after, work, at_start, at_end, heat, damped, fabric, inertia)
         return self.account
 
-    def _moving_targets(self, x: Array | None = None, *, stiff: bool = False) -> list[tuple[Array, Array]]:
-        """The moving targets, and the forces on them, by term, at positions x (n_local, 3) or those of the
-        state; of ``stiff`` terms alone, or of all.
-        """
-        terms, x = self._equations.active.targets, self._equations.x if x is None else x
-        return [
-            term.targets(x, self._equations.step.frozen[term]) for term in terms if term.is_stiff >= stiff
-        ]
-
-    def _external_forces(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
-        """From the parts of the residual F: forces (n_owned, 3) [N] of handles, springs, friction and loads
-        without a potential; forces (m,) of damping at the prescribed unknowns; heat [J] of damping.
-        """
-        equations = self._equations
-        self._at = at = equations.step.prescribed.indices
-        self._reactions, damping, heat = np.zeros(len(at)), np.zeros(len(at)), 0.0
-        self._reactions += equations.contact_end.impulses.handle_force
-        weight, here = np.zeros((equations.points.n_local, 3)), equations.targets_at(equations.step.at_stage)
+    def _working_forces(self, parts: Iterable[tuple[str, Array]]) -> WorkingForces:
+        """From the parts of the residual F at a stage the forces that do work."""
+        equations, step = self._equations, self._equations.step
+        self._at = at = step.prescribed.indices
+        self._reactions = equations.contact_end.impulses.handle_force + np.zeros(len(at))
+        weight, damping = np.zeros((equations.points.n_local, 3)), np.zeros((equations.points.n_owned, 3))
         for load in equations.active.loads:
             if load.registration.energy:  # loads with a potential do no external work
-                load.add_force(here, weight)
+                load.add_force(equations.targets_at(step.at_stage), weight)
         external = -weight[: equations.points.n_owned]
         for name, part in parts:
             self._reactions += part.take(at)
             if name in ("loads", "springs", "friction", "wind"):
                 external -= part
             elif name == "damping":
-                damping = part.take(at)
-                heat = equations.step.dt * float(np.vdot(equations.evaluated.v[: len(equations.mass)], part))
+                damping = part
             del part  # to save memory before the next part is computed
-        equations.step.prescribed.overwrite(external, external.take(at) + self._reactions)
-        return external, damping, heat
+        step.prescribed.overwrite(external, external.take(at) + self._reactions)
+        return WorkingForces(external, damping, step.end - step.at_stage)
 
     def saved_state(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint."""
-        return ({} if self._ends is None else {"pull": self._ends[0]}), asdict(self.budget)
+        if (last := self._last) is None:
+            return {}, asdict(self.budget)
+        return {"pull": last.work, "damping": last.heat}, {**asdict(self.budget), "ahead": last.ahead}
 
-    def restore(self, arrays: Mapping[str, Array], budget: Mapping[str, Any]) -> None:
+    def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, Any]) -> None:
         """Restore works from a checkpoint; energies are measured at the present state."""
-        self.budget = Budget(**{**budget, "more": {}})
-        self._stiff = self._moving_targets(stiff=True)
-        if self._ends is not None:
-            self._ends = arrays["pull"], self._moving_targets()
+        works = {**numbers, "more": {}}
+        if (ahead := works.pop("ahead", None)) is not None:
+            self._last = WorkingForces(arrays["pull"], arrays["damping"], ahead)
+        self.budget = Budget(**works)
         self.measure()
 
     @property

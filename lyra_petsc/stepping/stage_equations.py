@@ -228,7 +228,6 @@ class StageEquations:
             x_h=x_h,
             v_h=self.v[:n] if stage.v is None else stage.v,
             prescribed=held,
-            moving_energy=self.active.moving_energy(self.x, step.frozen),
         )
 
     def prescribe(self, v: Array) -> None:

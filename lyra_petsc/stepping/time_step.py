@@ -44,8 +44,6 @@ class TimeStep:
         Data of each term that are constant in the step.
     size : float
         Largest coordinate [m] at its start.
-    moving_energy : float
-        Energy [J] of this rank's terms with moving targets: positions at the start, targets at the stage.
     linear : bool
         Whether F is linear in the velocities, from the positions where the step starts (``semi-implicit``).
     lagged : bool
@@ -69,7 +67,6 @@ class TimeStep:
     loads: StepLoads
     frozen: Mapping[Term, Any]
     size: float = 0.0
-    moving_energy: float = 0.0
     linear: bool = False
     lagged: bool = False
     in_contact: bool = True

@@ -199,11 +199,6 @@ class MovingTargets(Elastic):
     amount of gas.
     """
 
-    is_stiff: ClassVar[bool] = False
-    """Whether the sheet follows the targets within a step: their work is then that of the forces at the
-    stage. Else it is the change of the energy by the targets alone, before the sheet moves.
-    """
-
     @abstractmethod
     def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:
         """These numbers, such as positions [m] of the targets of the owned elements, and this rank's part of

@@ -63,7 +63,6 @@ class SeamThreads(MovingTargets, HoldsTogether, WritesTable):
         Of the scene.
     """
 
-    is_stiff = True
     table = "seams.csv"
     table_columns = ("name", "gap", "fx", "fy", "fz", "opening", "shear")
     table_units = ("", "m", "N", "N", "N", "N", "N")

@@ -11,6 +11,7 @@ from physics import CLOTH, Simulation, finished, grid
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import EnergyBalance
+from lyra_petsc.terms.protocols import MovingTargets
 
 pytestmark = pytest.mark.parallel(2)
 
@@ -52,7 +53,9 @@ SCENES["all"] = SCENES["moving"] | SCENES["wind"] | SCENES["loads"] | SCENES["da
 
 
 def bracket(simulation: Simulation, before: Array) -> float:
-    """E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx [J] of the shell's elastic terms, in the last step."""
+    """E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx [J] of the shell's elastic terms, in the last step, less the work
+    of moving targets by the mean of the forces on them.
+    """
     equations = simulation.equations
     n = equations.points.n_owned
     change = 0.0
@@ -60,7 +63,16 @@ def bracket(simulation: Simulation, before: Array) -> float:
     for term in equations.active.elastic:
         if term.name != "spring":
             frozen = equations.step.frozen[term]
-            change += float(term.energies(equations.x, frozen).sum() - term.energies(before, frozen).sum())
+            change += float(term.energies(equations.x, frozen).sum())
+            if isinstance(term, MovingTargets):
+                start = term.freeze(equations.targets_at(equations.step.start))
+                change -= float(term.energies(before, start).sum())
+                (place, force), (old, old_force) = (
+                    term.targets(x, at) for x, at in ((equations.x, frozen), (before, start))
+                )
+                change -= 0.5 * float(np.vdot(force + old_force, place - old))
+            else:
+                change -= float(term.energies(before, frozen).sum())
             term.add_gradient(equations.x, frozen, gradient)
     change -= float(np.vdot(gradient[:n], equations.x[:n] - before[:n]))
     return float(simulation.comm.allreduce(change))

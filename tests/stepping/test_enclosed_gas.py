@@ -23,8 +23,8 @@ pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 FABRIC = {"density": 0.2, "membrane": {"c11": 2000.0, "c22": 2000.0, "c12": 600.0, "c33": 700.0}}
 RUBBER = {"young": 1e6, "poisson": 0.5, "thickness": 3e-4, "density": 1000.0, "law": "neo-hookean"}
 
-LOSSES = {"midpoint": 5e-5, "alpha2": 5e-4, "bdf2": 1e-3}
-"""Largest error [J] of the balance of energies."""
+LOSSES = {"midpoint": 5e-5, "alpha2": 5e-4, "bdf2": 5e-4}
+"""Largest error [J] of the balance of energies at any time, with steps of 1 ms."""
 
 PUMPED = [[0.0, 1.0], [0.05, 1.05], [0.2, 1.02]]
 
@@ -60,23 +60,24 @@ def test_gas_keeps_its_law_and_the_balance_of_energies(
     comm: MPI.Comm, integrator: str, shared_tmp: Path
 ) -> None:
     lost = []
-    for step in (0.004, 0.002):
+    for step in (0.002, 0.001):
         simulation = SteppedScene(comm, scene_of(inflated(comm, shared_tmp, integrator, step)))
         ((first, pressure, _),) = rows(simulation)
         assert abs(pressure) < 1e-9
-        start = simulation.budget.total
+        start, path = simulation.budget.total, [0.0]
         while not simulation.finished:
             simulation.step()
+            budget = simulation.budget
+            path.append(start + budget.external_work - budget.dissipation - budget.total)
         ((volume, pressure, amount),) = rows(simulation)
-        budget = simulation.budget
         simulation.destroy()
         assert amount == pytest.approx(1.04)
         expected = (amount * first / volume) ** 1.4 * 5000.0 - 5000.0
         assert pressure == pytest.approx(expected, rel=1e-6)
-        lost.append(start + budget.external_work - budget.dissipation - budget.total)
+        lost.append(max(path, key=abs))
     assert budget.external_work == pytest.approx(0.976, abs=0.005)  # of pumping
     if integrator in LOSSES:
-        assert abs(lost[1]) < LOSSES[integrator]
+        assert abs(lost[1]) < min(LOSSES[integrator], 0.35 * abs(lost[0]))
     else:  # of first order
         assert 0.0 < lost[1] < 0.8 * lost[0]
 

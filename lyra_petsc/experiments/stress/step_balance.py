@@ -215,8 +215,7 @@ class BalanceRecorder:
         constraints = equations.active.external
         self._sheet_terms = [term for term in equations.active.elastic if term not in constraints]
         # with their targets in motion, energies of other terms change with positions alone
-        moving = equations.active.moving
-        self._turning = [term for term in moving if term.registration.of_contact or not self._identity]
+        self._turning = equations.active.moving
         self.record_state()
 
     def record_state(self) -> None:
@@ -263,7 +262,7 @@ class BalanceRecorder:
         change = account.after.elastic - account.before.elastic + account.fabric_heat
         sizes = [change, work]
         if self._identity:
-            change, work = account.bracket + account.obstacle_work, work - inner
+            change, work = account.bracket + account.moved, work - inner
             sizes = [account.change, account.inertia, account.heat, account.bracket, account.external]
         return StepBalance(
             account=account,

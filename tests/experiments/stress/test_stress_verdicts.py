@@ -16,8 +16,7 @@ from lyra_petsc.stepping.energy_balance import Budget, StepAccount
 from lyra_petsc.stepping.simulation import StepReport
 
 ACCOUNT = StepAccount(
-    Budget(), Budget(kinetic=-0.5), moving_before=0.0, moving=0.0, external=0.1, obstacle_work=0.0,
-    obstacle_work_at_start=0.0,
+    Budget(), Budget(kinetic=-0.5), external=0.1, moved_at_start=0.0, moved=0.0,
     heat=0.1, damping_heat=0.1, fabric_heat=0.0, inertia=0.3,
 )  # fmt: skip
 """Its bracket is −0.2 J."""
