@@ -1,4 +1,4 @@
-"""Closed surfaces for tests: spheres, and boxes with a wall between two chambers."""
+"""Closed surfaces for tests: spheres, boxes with a wall between two chambers, and sewn layers of sheets."""
 
 from __future__ import annotations
 
@@ -63,3 +63,24 @@ def walled_box(path: Path, n: int) -> dict[str, Any]:
         lines += [f"g {group}", *("f " + " ".join(map(str, triangle)) for triangle in triangles)]
     path.write_text("\n".join(lines) + "\n")
     return {"file": str(path)}
+
+
+def sewn_layers(numbers: Sequence[int], gap: float, seam: dict[str, Any]) -> dict[str, Any]:
+    """Keys ``mesh`` and ``seams`` of square sheets ``layer0``, ``layer1``, … of 0.2 m above each other, with
+    these numbers of edges along their sides, each sewn to the next one along all four.
+    """
+    return {
+        "mesh": [
+            {
+                "name": f"layer{k}",
+                "grid": {"width": 0.2, "height": 0.2, "nx": n, "ny": n},
+                "transform": {"translate": [0.0, 0.0, k * gap]},
+            }
+            for k, n in enumerate(numbers)
+        ],
+        "seams": [
+            {"between": [f"layer{k}/{side}", f"layer{k + 1}/{side}"]} | seam
+            for k in range(len(numbers) - 1)
+            for side in ("left", "right", "top", "bottom")
+        ],
+    }

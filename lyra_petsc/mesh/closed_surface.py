@@ -1,13 +1,18 @@
-"""Closed surfaces of triangles: their holes, and a common orientation."""
+"""Closed surfaces of triangles: their holes, the gaps of seams, and a common orientation."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.mesh.topology import connected_components, edge_table, side_vertices
+from lyra_petsc.mesh.topology import connected_components, edge_table, side_vertices, walk
+
+if TYPE_CHECKING:
+    from lyra_petsc.mesh.seams import SeamSide, SewnCurves
 
 
 class Hole(NamedTuple):
@@ -28,15 +33,14 @@ class Hole(NamedTuple):
 
 def holes(points: Array, triangles: Ints) -> list[Hole]:
     """The boundary curves of triangles (F, 3), longest first; curves with a common vertex are one."""
-    table = edge_table(triangles)
-    ends = side_vertices(triangles, table.sides[table.first[table.sizes == 1]])[:, :2]
+    ends = _boundary(triangles)
     vertices, own = np.unique(ends, return_inverse=True)
     own = own.reshape(-1, 2)
     curve = connected_components(len(vertices), own)[own[:, 0]]
     lengths = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
     curves = [curve == number for number in np.unique(curve)]
     listed = [
-        Hole(points[ends[mine, 0]].mean(axis=0), float(lengths[mine].sum()), int(mine.sum()))
+        Hole(points[ends[mine]].mean(axis=(0, 1)), float(lengths[mine].sum()), int(mine.sum()))
         for mine in curves
     ]
     return sorted(listed, key=lambda hole: -hole.length)
@@ -76,3 +80,50 @@ def outward(points: Array, triangles: Ints) -> tuple[Ints, int]:
     volume = np.bincount(piece, np.where(turned, -sixth, sixth))
     turned = turned != (volume < 0.0)[piece]
     return np.where(turned[:, None], triangles[:, ::-1], triangles), int(turned.sum())
+
+
+def _boundary(triangles: Ints) -> Ints:
+    """Edges (m, 2) of one triangle."""
+    table = edge_table(triangles)
+    return side_vertices(triangles, table.sides[table.first[table.sizes == 1]])[:, :2]
+
+
+def sewn_shut(triangles: Ints, seams: Sequence[SewnCurves]) -> Ints:
+    """Triangles (F, 3), and those that fill the gaps of seams between them, and the corners between gaps.
+
+    Between its sides a seam has a strip of triangles, and at its ends an edge from one side to the other;
+    curves of such edges alone are filled, too. The vertices are those of both sides, so that a strip is as
+    wide as its seam is open, and encloses nothing once the seam is closed.
+    """
+    boundary = {frozenset(edge) for edge in _boundary(triangles).tolist()}
+    strips, ends = [triangles], set()
+    for sewn in seams:
+        paths = [side.vertices.tolist() for side in sewn.sides]
+        if all(frozenset(edge) in boundary for path in paths for edge in pairwise(path)):
+            strips.append(_strip(*sewn.sides))
+            ends |= {frozenset((one[at], other[at])) for one, other in (paths,) for at in (0, -1)}
+    shut = np.concatenate(strips)
+    shut = shut[(shut != np.roll(shut, 1, axis=1)).all(axis=1)]  # where both sides have a vertex in common
+    left = np.array([e for e in _boundary(shut).tolist() if frozenset(e) in ends], dtype=np.int64).reshape(
+        -1, 2
+    )
+    curve = connected_components(int(triangles.max()) + 1, left)[left[:, 0]]
+    for number in np.unique(curve):
+        if (np.bincount(left[curve == number].ravel()) % 2 == 0).all():
+            corner = walk(left[curve == number])[:-1]
+            fan = [(corner[0], *edge) for edge in pairwise(corner[1:].tolist())]
+            shut = np.concatenate([shut, np.array(fan, dtype=np.int64).reshape(-1, 3)])
+    return shut
+
+
+def _strip(one: SeamSide, other: SeamSide) -> Ints:
+    """Triangles (m, 3) between the sides of a seam, one for each edge, in the order of their middles."""
+    middle, opposite = ((0.5 * (side.place[:-1] + side.place[1:]) / side.length) for side in (one, other))
+    passed = other.vertices[np.searchsorted(opposite, middle, side="left")]
+    reached = one.vertices[np.searchsorted(middle, opposite, side="right")]
+    return np.concatenate(
+        [
+            np.stack([one.vertices[:-1], one.vertices[1:], passed], axis=1),
+            np.stack([reached, other.vertices[1:], other.vertices[:-1]], axis=1),
+        ]
+    )

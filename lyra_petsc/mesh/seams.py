@@ -17,7 +17,7 @@ from lyra_petsc.mesh.measures import SAME_PLACE, mean_edge_length
 from lyra_petsc.mesh.mesh import Group, Mesh, Source
 from lyra_petsc.mesh.readers import first_few
 from lyra_petsc.mesh.select import DIMENSION_NAMES, find_group
-from lyra_petsc.mesh.topology import Hinges, connected_components, edge_table, side_vertices
+from lyra_petsc.mesh.topology import Hinges, connected_components, edge_table, side_vertices, walk
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.seam_block import Seam
 
@@ -258,29 +258,13 @@ def _curve(mesh: Mesh, edges: _Edges, name: str, key: str, file: object | None) 
     if pieces > 1:
         hint = "; name the sheet, as in sheet/group" if len(mesh.sources) > 1 and "/" not in name else ""
         raise refuse(f"is {pieces} curves, not one{hint}")
-    vertices = _walk(group)
+    vertices = walk(group.edges)
     steps = np.stack([vertices[:-1], vertices[1:]], axis=1)
     length, count = edges.of(steps)
     if not count.all():
         a, b = steps[count.argmin()]
         raise refuse(f"has the edge {a}-{b}, which is none of a triangle")
     return SeamSide(vertices, np.concatenate([[0.0], np.cumsum(length)]))
-
-
-def _walk(group: Group) -> Ints:
-    """Vertices of a curve in order, from its end of lower number; of a closed one from the lowest."""
-    around: dict[int, list[int]] = {}
-    for a, b in group.edges.tolist():
-        around.setdefault(a, []).append(b)
-        around.setdefault(b, []).append(a)
-    ends = [vertex for vertex, others in around.items() if len(others) == 1]
-    path = [min(ends or around)]
-    before = -1
-    while len(path) <= len(group.edges):
-        following = [vertex for vertex in around[path[-1]] if vertex != before]
-        before = path[-1]
-        path.append(min(following))
-    return np.array(path, dtype=np.int64)
 
 
 def join_seams(scene: Scene, mesh: Mesh) -> Mesh:
@@ -296,11 +280,11 @@ def join_seams(scene: Scene, mesh: Mesh) -> Mesh:
     """
     same: Ints = np.arange(mesh.n_vertices)
     edge, edges = mean_edge_length(mesh), _Edges(mesh)
-    taken: dict[tuple[int, int], int] = {}
+    taken: set[tuple[int, int, frozenset[str]]] = set()
     for number, (seam, sewn) in enumerate(zip(scene.seams, sewn_curves(scene, mesh), strict=True)):
         key = f"seams[{number}].between"
         for curve in sewn.sides:
-            _check_boundary(curve, edges, number, taken, key, scene.source)
+            _check_boundary(curve, edges, frozenset(seam.between), taken, key, scene.source)
         one, other = sewn.sides
         if seam.rigid and one.own == other.own:
             pairs = np.stack([one.vertices, other.vertices])
@@ -385,21 +369,23 @@ def _links(same: Ints) -> Ints:
 def _check_boundary(
     curve: SeamSide,
     edges: _Edges,
-    number: int,
-    taken: dict[tuple[int, int], int],
+    pair: frozenset[str],
+    taken: set[tuple[int, int, frozenset[str]]],
     key: str,
     file: object | None,
 ) -> None:
-    """Refuse edges of more than one triangle, and those that are sewn already; ``taken`` gets the edges."""
+    """Refuse edges of more than one triangle, and those that are sewn to themselves or twice to the same
+    ``pair`` of groups; ``taken`` gets the edges. Three sheets meet in several seams.
+    """
     steps = np.sort(np.stack([curve.vertices[:-1], curve.vertices[1:]], axis=1), axis=1)
     _, count = edges.of(steps)
     for (a, b), triangles in zip(steps.tolist(), count.tolist(), strict=True):
         if triangles > 1:
             raise InputError(f"edge {a}-{b} is inside the sheet; sew boundary edges", key=key, file=file)
-        if (a, b) in taken:
-            where = "to itself" if taken[a, b] == number else f"by seams[{taken[a, b]}] already"
-            raise InputError(f"edge {a}-{b} is sewn {where}", key=key, file=file)
-        taken[a, b] = number
+        if (a, b, pair) in taken:
+            message = f"edge {a}-{b} is sewn to itself, or twice to the same group"
+            raise InputError(message, key=key, file=file)
+        taken.add((a, b, pair))
 
 
 def _joined(mesh: Mesh, same: Ints, scene: Scene) -> Mesh:

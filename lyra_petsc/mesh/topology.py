@@ -153,3 +153,21 @@ def connected_components(n: int, pairs: Ints) -> Ints:
             component = shorter
         pairs = pairs[component[pairs[:, 0]] != component[pairs[:, 1]]]
     return component
+
+
+def walk(edges: Ints) -> Ints:
+    """Vertices of a curve of edges (m, 2) in order, from its end of lower number; of a closed one from the
+    lowest, which is at both ends.
+    """
+    around: dict[int, list[int]] = {}
+    for a, b in edges.tolist():
+        around.setdefault(a, []).append(b)
+        around.setdefault(b, []).append(a)
+    ends = [vertex for vertex, others in around.items() if len(others) == 1]
+    path = [min(ends or around)]
+    before = -1
+    while len(path) <= len(edges):
+        following = [vertex for vertex in around[path[-1]] if vertex != before]
+        before = path[-1]
+        path.append(min(following))
+    return np.array(path, dtype=np.int64)

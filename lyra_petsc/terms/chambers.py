@@ -26,7 +26,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.vector3 import cross, dot, minus, point
-from lyra_petsc.mesh.closed_surface import branches, holes, outward
+from lyra_petsc.mesh.closed_surface import branches, holes, outward, sewn_shut
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_triangles
@@ -320,13 +320,19 @@ def _closed(rest: RestShape, chamber: Chamber, key: str) -> Ints:
         np.concatenate([select_triangles(mesh, name, key=f"{key}.group", file=file) for name in names])
     )
     triangles = mesh.triangles[chosen]
+    if rest.scene.seams:
+        from lyra_petsc.mesh.seams import sewn_curves  # with seams only
+
+        triangles = sewn_shut(triangles, sewn_curves(rest.scene, mesh))
     problem = _open(mesh, triangles)
     if not problem:
-        triangles, turned = outward(mesh.positions, triangles)
-        if turned < 0:
+        shut, n = triangles, len(chosen)
+        triangles, common = outward(mesh.positions, shut)
+        turned = int((triangles[:n] != shut[:n]).any(axis=1).sum())  # not of those that fill gaps
+        if common < 0:
             problem = "the surface has no inside: like a Klein bottle it cannot be oriented"
         elif turned:
-            which = "the" if turned == len(triangles) else f"{turned} of {len(triangles)}"
+            which = "the" if turned == n else f"{turned} of {n}"
             rest.notes.append(
                 f"{key}: {which} normals point inwards; the pressure acts outwards all the same"
             )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from closed_surfaces import sphere, walled_box
+from closed_surfaces import sewn_layers, sphere, walled_box
 from mpi4py import MPI
 from physics import end_on_one_rank, finished, obj_file, scene_of, shape, stepped
 
@@ -17,6 +17,7 @@ from lyra_petsc.scene.schema import INTEGRATORS
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.statics.stability import Examination
 from lyra_petsc.terms.chambers import Chambers
+from lyra_petsc.terms.seam import SeamThreads
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 
@@ -167,6 +168,56 @@ def test_two_chambers_share_a_wall(comm: MPI.Comm, shared_tmp: Path) -> None:
     assert 40.0 > p1 > p2 > 0.0
     assert (p1 + 5000.0) * left**1.4 == pytest.approx(5040.0, rel=1e-9)
     assert (p2 + 5000.0) * right**1.4 == pytest.approx(5000.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("numbers", [(4, 4), (4, 6)])
+def test_a_cushion_sewn_by_threads_keeps_its_gas(comm: MPI.Comm, numbers: tuple[int, int]) -> None:
+    # the gaps of the seams are part of the surface as they close, and then the cushion is inflated
+    amount = [[0.0, 1.0], [0.05, 1.0], [0.1, 1.5]]
+    content = sewn_layers(numbers, 0.01, {"close": {"until": 0.05}}) | {
+        "material": FABRIC | {"bending": 1e-4, "damping": 0.005},
+        "loads": [{"gas": {"pressure": 0.0, "amount": amount}}],
+        "time": {"end": 0.1, "step": 0.005},
+    }
+    with stepped(comm, content) as simulation:
+        path = rows(simulation)
+        start = simulation.budget.total
+        while not simulation.finished:
+            simulation.step()
+            path += rows(simulation)
+        seam, here = simulation.problem.terms["seam"], simulation.problem.equations.here()
+        assert isinstance(seam, SeamThreads)
+        gaps = [float(row[1]) for row in seam.table_rows(here.x, here.frozen[seam])]
+        budget = simulation.budget
+    volume, pressure, amounts = np.array(path).T
+    assert volume[0] == pytest.approx(0.2 * 0.2 * 0.01)
+    constant = (pressure + 101325.0) * (volume / amounts) ** 1.4
+    np.testing.assert_allclose(constant, 101325.0 * volume[0] ** 1.4, rtol=1e-6)
+    assert max(gaps) < 1e-4 * 0.05
+    assert volume[-1] == pytest.approx(1.5 * volume[0], rel=1e-3)
+    lost = start + budget.external_work - budget.dissipation - budget.total
+    assert 0.0 < lost < 0.5 * budget.external_work  # by backward Euler
+
+
+def test_two_chambers_share_a_sewn_wall(comm: MPI.Comm) -> None:
+    loads = [
+        {"gas": {"group": ["layer1", f"layer{k}"], "name": name, "pressure": pressure, "ambient": 5000.0}}
+        for k, name, pressure in ((0, "below", 40.0), (2, "above", 0.0))
+    ]
+    content = sewn_layers((4, 3, 4), 0.02, {}) | {
+        "material": FABRIC,
+        "handles": [{"group": "layer0"}, {"group": "layer2"}],
+        "loads": loads,
+        "time": {"analysis": "static"},
+    }
+    with finished(comm, content) as simulation:
+        (below, p1, _), (above, p2, _) = rows(simulation)
+    # the outer layers are held; the wall, sewn to both, bulges into the other chamber
+    assert below + above == pytest.approx(0.2 * 0.2 * 0.04, rel=1e-6)
+    assert below > 1.001 * 0.2 * 0.2 * 0.02
+    assert 40.0 > p1 > p2 > 0.0
+    assert (p1 + 5000.0) * below**1.4 == pytest.approx(5040.0 * 8e-4**1.4, rel=1e-9)
+    assert (p2 + 5000.0) * above**1.4 == pytest.approx(5000.0 * 8e-4**1.4, rel=1e-9)
 
 
 def test_gas_stabilises_a_balloon_beyond_its_limit_point(

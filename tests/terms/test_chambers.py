@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from closed_surfaces import sphere, walled_box
+from closed_surfaces import sewn_layers, sphere, walled_box
 from examples import example
 from mpi4py import MPI
 from oracle import frozen_by, gradient
@@ -80,6 +80,43 @@ def test_holes_are_named(tmp_path: Path) -> None:
     assert error.key == "loads[0].gas"
     error = refusal(grid(1.0, 2.0, 2, 2), gas)
     assert "1 hole: 6 m long (8 edges) around (0.5, 1, 0)" in error.message
+
+
+@pytest.mark.parametrize("numbers", [(3, 3), (3, 5)])
+def test_a_surface_is_closed_over_the_gaps_of_its_seams(numbers: tuple[int, ...]) -> None:
+    gas = {"gas": {"pressure": 5.0}}
+    content = sewn_layers(numbers, 0.01, {"close": {"until": 0.1}}) | {"material": CLOTH, "loads": [gas]}
+    with Simulation(content, MPI.COMM_SELF) as own:
+        term, x = chambers(own), own.equations.x
+        frozen = frozen_by(term, own.equations)
+        ((_, volume, *_),) = term.table_rows(x, frozen)
+        assert volume == pytest.approx(4e-4, rel=1e-12)
+        force = -gradient(term, x, frozen)
+        np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-9)
+        # the strips of the gaps are pushed outwards: half of their load is on each side
+        right = np.abs(x[:, 0] - 0.2) < 1e-9
+        below = right & (x[:, 2] < 1e-9)
+        assert force[right, 0].sum() == pytest.approx(5.0 * 0.2 * 0.01, rel=1e-6)
+        assert 0.3 < force[below, 0].sum() / force[right, 0].sum() < 0.7
+        # as the sides close the gap vanishes, and the layers enclose what is between them
+        x, corners = x.copy(), own.problem.terms["membrane"].stencil
+        upper = x[corners[:, 0], 2] > 0.005
+        edge = (np.abs(x[:, :2] - 0.1) > 0.1 - 1e-9).any(axis=1)
+        x[edge, 2] = 0.005
+        ((_, volume, *_),) = term.table_rows(x, frozen)
+    one, other = (x[corners][:, k, :2] - x[corners][:, 0, :2] for k in (1, 2))
+    below_each = (
+        0.5 * np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]) * x[corners][:, :, 2].mean(axis=1)
+    )
+    assert volume == pytest.approx(below_each[upper].sum() - below_each[~upper].sum(), rel=1e-12)
+
+
+def test_an_open_side_is_no_gap() -> None:
+    content = sewn_layers((3, 3), 0.01, {}) | {"material": CLOTH, "loads": [{"gas": {"pressure": 5.0}}]}
+    content["seams"] = content["seams"][1:]  # not the left one
+    with pytest.raises(InputError) as caught, Simulation(content, MPI.COMM_SELF):
+        pass
+    assert "1 hole: 0.42 m long (8 edges) around (0, 0.1, 0.005)" in caught.value.message
 
 
 @pytest.mark.parametrize(
