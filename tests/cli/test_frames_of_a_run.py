@@ -107,3 +107,21 @@ def test_the_body_is_exported_and_drawn_where_its_frames_are(tmp_path: Path) -> 
     assert (tmp_path / "run" / "picture-0.05.png").exists()
     (tmp_path / "walk.npz").unlink()
     refused(["render", "run", "--at", "0", "--size", "160x120"], tmp_path, "walk.npz")
+
+
+def test_the_cloth_of_a_run_is_the_body_of_another(tmp_path: Path) -> None:
+    """By export --to npz and obj, as frames of a body and, from the whole mesh, of a handle."""
+    one = SCENE[: SCENE.index("contact")] + "time: {end: 0.03, step: 0.01}\noutput: {every: 0.01}\n"
+    done(["run", write_scene(tmp_path, one), "--out", "one"], tmp_path)
+    done(["export", "one", "--to", "npz"], tmp_path)
+    done(["export", "one", "--to", "obj"], tmp_path)
+    body = "{mesh: {file: one/obj/one_0000.obj, frames: one/npz/one.npz}, interpolation: linear}"
+    sheet = SCENE[: SCENE.index("contact")].replace("0.004]", "0.02]")
+    other = sheet + "contact: {gap: 0.005}\n" + f"obstacles:\n  below: {body}\n"
+    other += "handles: [{group: left, frames: one/npz/one.npz, interpolation: linear}]\n"
+    (tmp_path / "two.yaml").write_text(other + "time: {end: 0.03, step: 0.01}\noutput: {every: 0.01}\n")
+    done(["run", "two.yaml", "--out", "two"], tmp_path, ranks=2)
+    first, second = (lyra_petsc.Run(tmp_path / name) for name in ("one", "two"))
+    moved = [run.positions[-1][::7] - run.positions[0][::7] for run in (first, second)]
+    assert np.abs(moved[0]).max() > 2e-3
+    np.testing.assert_allclose(moved[1], moved[0], atol=1e-9)

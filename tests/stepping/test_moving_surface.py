@@ -170,3 +170,48 @@ def test_vertices_pulled_by_frames_move_as_by_keyframes(
     pulled = {"group": "left", "frames": str(shared_tmp / "pins.npz"), "interpolation": "linear"}
     by_frames = final(comm, content | {"handles": [pulled, {"group": "right"}]})
     assert np.abs(by_frames - by_keyframes).max() < 1e-9
+
+
+@pytest.mark.parametrize("mover", ["obstacle", "handle"])
+def test_frames_run_over_the_load_factor_of_a_static_analysis(
+    comm: MPI.Comm, shared_tmp: Path, mover: str
+) -> None:
+    """As keyframes; the load steps end at frames, and the body pushes the sheet up."""
+    strip = grid(0.4, 0.1, 8, 2) | {"transform": {"translate": [-0.2, -0.05, 0.004]}}
+    keyframes = [
+        {"time": t, "translate": shift}
+        for t, shift in ((0.0, [0, 0, 0]), (0.4, [0, 0, 0.01]), (1.0, [0, 0, 0.03]))
+    ]
+    ends = [{"group": "left"}, {"group": "right"}]
+    content: dict[str, Any] = {
+        "mesh": strip,
+        "material": {"young": 1e6, "poisson": 0.3, "thickness": 1e-3, "density": 1.0},
+        "gravity": [0, 0, -9.81],
+        "handles": ends,
+        "time": {"analysis": "static", "step": 0.3},
+        "solver": {"force_tolerance": 1e-10},
+    }
+    if comm.rank == 0:
+        write(shared_tmp)
+        left = np.array([[-0.2, 0.05 * k - 0.05, 0.0] for k in range(3)])
+        for name, points in (("rise.npz", [0.2, 0.2, 1.0] * CORNERS), ("pins.npz", left)):
+            shifts = np.array([keyframe["translate"] for keyframe in keyframes])
+            times = [keyframe["time"] for keyframe in keyframes]
+            np.savez(shared_tmp / name, time=times, position=points + shifts[:, None])
+    comm.barrier()
+    motion, frames = {"motion": keyframes}, {}
+    if mover == "obstacle":
+        mesh = {"file": str(shared_tmp / "box.obj"), "transform": {"scale": [0.2, 0.2, 1.0]}}
+        content |= {"contact": {"gap": 0.003}}
+        by_keyframes = content | {"obstacles": {"box": {"mesh": mesh, "interpolation": "linear"} | motion}}
+        mesh = mesh | {"frames": str(shared_tmp / "rise.npz")}
+        mesh.pop("transform")
+        by_frames = content | {"obstacles": {"box": {"mesh": mesh, "interpolation": "linear"}}}
+    else:
+        end = {"group": "left", "interpolation": "linear"}
+        by_keyframes = content | {"handles": [end | {"motion": "up"}, ends[1]], "motions": {"up": keyframes}}
+        frames = {"frames": str(shared_tmp / "pins.npz")}
+        by_frames = content | {"handles": [end | frames, ends[1]]}
+    reached, expected = final(comm, by_frames), final(comm, by_keyframes)
+    assert expected[:, 2].max() > 0.025
+    assert np.abs(reached - expected).max() < 1e-6
