@@ -271,30 +271,39 @@ def end_on_one_rank(comm: MPI.Comm, scene: Scene, folder: Path, steps: int) -> A
 
     So many steps are taken on all ranks; the run goes on from its checkpoint in ``folder`` on rank 0 alone.
     """
-    simulation = SteppedScene(comm, scene)
-    recorder = Recorder(simulation)
-    if comm.rank == 0:
-        folder.mkdir()
-    comm.Barrier()
-    recorder.begin(folder)
-    for _ in range(steps):
-        recorder.record(simulation.step())
-    recorder.write_checkpoint()
-    recorder.flush()
-    recorder.close()
-    simulation.destroy()
-    few, x = comm.Split(0 if comm.rank == 0 else 1), None
-    if comm.rank == 0:
-        resumed = SteppedScene(few, scene)
-        again = Recorder(resumed)
-        again.resume(folder)
-        assert resumed.step_number == steps
-        while not resumed.finished:
-            again.record(resumed.step())
-        again.flush()
-        again.close()
-        x = shape(resumed)
-        resumed.destroy()
-    few.Free()
-    comm.Barrier()
-    return x
+    return end_on_changing_ranks(comm, scene, folder, [(comm.size, steps), (1, None)])
+
+
+def end_on_changing_ranks(
+    comm: MPI.Comm, scene: Scene, folder: Path, parts: Sequence[tuple[int, int | None]]
+) -> Array | None:
+    """Positions at the end of a run (V, 3) in mesh order, on rank 0; None on the others; collective.
+
+    The run consists of ``parts``: on so many ranks it goes on from its checkpoint in ``folder`` to the step
+    of this number, or to its end.
+    """
+    x, before = None, 0
+    for ranks, steps in parts:
+        few = comm.Split(0 if comm.rank < ranks else 1)
+        if comm.rank < ranks:
+            simulation = SteppedScene(few, scene)
+            recorder = Recorder(simulation)
+            if before == 0:
+                if comm.rank == 0:
+                    folder.mkdir()
+                few.Barrier()
+                recorder.begin(folder)
+            else:
+                recorder.resume(folder)
+            assert simulation.step_number == before
+            while not simulation.finished and simulation.step_number != steps:
+                recorder.record(simulation.step())
+            recorder.write_checkpoint()
+            recorder.flush()
+            recorder.close()
+            x = shape(simulation)
+            simulation.destroy()
+        few.Free()
+        comm.Barrier()
+        before = steps or 0
+    return x if comm.rank == 0 else None

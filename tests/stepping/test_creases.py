@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from folded_strips import strip
 from mpi4py import MPI
-from physics import end_on_one_rank, finished, scene_of, shape, stepped
+from physics import end_on_changing_ranks, end_on_one_rank, finished, scene_of, shape, stepped
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
@@ -160,6 +160,47 @@ def test_ranks_agree_and_a_run_goes_on_on_another_number(
     resumed = end_on_one_rank(comm, scene, shared_tmp / "run", 7)
     if resumed is not None:
         np.testing.assert_allclose(resumed, x, rtol=0.0, atol=1e-7)
+
+
+def on_a_floor(comm: MPI.Comm, folder: Path, model: str, integrator: str) -> dict[str, Any]:
+    """A strip with a valley and a mountain that falls on a floor, and yields."""
+    creases = [
+        {"group": "valley", "angle": [[0.0, 0.0], [0.1, 60.0], [0.2, 30.0]], "stiffness": 0.05},
+        {"group": "mountain", "angle": [[0.0, 0.0], [0.15, -100.0]], "stiffness": 0.1},
+    ]
+    content = folded(comm, folder, model, creases, {"valley": 1, "mountain": 3}, nx=5)
+    content["material"] |= {"bending": 0.05, "yield_curvature": 0.05, "hardening": 0.1}
+    if model == "midedge":
+        content["material"]["friction_moment"] = 1e-3
+    return content | {
+        "gravity": [0.0, 0.0, -9.81],
+        "obstacles": {"floor": {"plane": {"point": [0, 0, -0.1], "normal": [0, 0, 1]}, "friction": 0.3}},
+        "contact": {"gap": 0.02},
+        "time": {"end": 0.2, "step": 0.01, "integrator": integrator},
+    }
+
+
+@pytest.mark.parametrize(("model", "integrator"), [("hinge", "beuler"), ("midedge", "midpoint")])
+def test_creases_touch_and_panels_yield_on_changing_ranks(
+    comm: MPI.Comm, model: str, integrator: str, shared_tmp: Path
+) -> None:
+    scene, touched = scene_of(on_a_floor(comm, shared_tmp, model, integrator)), 0
+    with stepped(comm, scene) as simulation:
+        while not simulation.finished:
+            simulation.step()
+            touched += simulation.problem.equations.contact_end.touches
+        x, heat = shape(simulation), simulation.budget.dissipation
+    turned = angles(x, 5)
+    assert touched > 5
+    assert heat > 1e-3
+    assert x[:, 2].min() > -0.1
+    assert np.diff(turned)[1] > 5.0  # by yielding of the panel, up against its weight
+    assert np.diff(turned)[0] < -5.0
+    assert np.diff(turned)[2] < -5.0
+    parts = [(1, 7), (min(2, comm.size), 14), (comm.size, None)]
+    resumed = end_on_changing_ranks(comm, scene, shared_tmp / "run", parts)
+    if resumed is not None:
+        np.testing.assert_allclose(resumed, x, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parallel(1)
