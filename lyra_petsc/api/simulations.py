@@ -79,14 +79,11 @@ class SavedState:
         How all that is driven goes on.
     forces : (n, 3) or None
         The forces [N] that the program has set.
-    jumps : tuple of float
-        Times [s] at which forces jump.
     """
 
     checkpoint: Checkpoint
     driven: dict[str, Any]
     forces: Array | None
-    jumps: tuple[float, ...]
 
 
 class Simulation:
@@ -317,15 +314,13 @@ class Simulation:
         """The present state in memory, for `restore`."""
         kept = copy.deepcopy(checkpoint_of(self._running))
         forces = None if self._forces is None else self._forces.forces.copy()
-        return SavedState(kept, self._controls.saved_state(), forces, self._running.jumps)
+        return SavedState(kept, self._controls.saved_state(), forces)
 
     def restore(self, saved: SavedState) -> None:
         """Return to a state that this simulation has saved; it goes on as it went on from there."""
         self.reset()
         run = self._running
         self._controls.restore(saved.driven)
-        for time in saved.jumps:
-            run.expect_jump(time)
         order = FileOrder(self.comm, self.vertices, run.problem.points.n_vertices_global)
         take(run, saved.checkpoint, order)
         if saved.forces is not None:

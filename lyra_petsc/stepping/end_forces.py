@@ -241,11 +241,13 @@ class EndForces:
         return out[:n]
 
     def _handle_work(self, ends: tuple[StepEndState, StepEndState], moved: Array, damping: Array) -> float:
-        """Work [J] of exact handles on this rank, by the reactions to the sheet's forces and weight."""
+        """Work [J] of exact handles on this rank, by the reactions to the sheet's forces and weight;
+        collective.
+        """
         equations, step = self._equations, self._equations.step
         at = step.prescribed.indices
         displacement = moved.take(at)
-        if not displacement.any():
+        if not any(equations.points.global_max(bool(displacement.any()))):
             return 0.0
         start = self._start.get("pull")
         if start is None:

@@ -36,6 +36,7 @@ def saved_state(run: SteppedScene) -> tuple[dict[str, Array], dict[str, Any]]:
         "integrator": integrator,
         **stepper,
         "energy": None if run.guard is None else run.guard.saved_state(),
+        "jumps": run.jumps,
         "late_starts": sorted(equations.reference.late),
         "obstacles": {} if equations.contact is None else equations.contact.places,
     }
@@ -69,6 +70,8 @@ def resume(
     equations.hold_targets(run.time)
     refuse_overrun(equations, run.scene, f"at {run.time_text()}")
     refuse_contact(equations, run.scene, f"at {run.time_text()}")
+    for jump in scalars["jumps"]:
+        run.expect_jump(jump)
     run.energy_balance.restore(arrays, scalars["budget"])
     run.control.restore(scalars)
     if run.equilibrium is not None:

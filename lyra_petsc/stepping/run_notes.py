@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lyra_petsc.stepping.stepper import Attempt
+from lyra_petsc.terms.protocols import Event
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.simulation import SteppedScene
@@ -90,8 +92,17 @@ def note_of_repeats(run: SteppedScene) -> str:
     return f"{note}; {run.step_number} steps were taken where {planned} of the full Δt would do"
 
 
-def note_step(run: SteppedScene, attempt: Attempt) -> None:
-    """Note what is remarkable about the step just accepted; collective."""
+def events(run: SteppedScene) -> list[Event]:
+    """What happens to elements of terms at the end of the step, by subject and size; collective."""
+    equations = run.problem.equations
+    told: list[list[Event]] = []
+    for term in equations.active.telling:
+        told += run.comm.allgather(term.events(equations.x, equations.step.frozen[term]))
+    return sorted(chain(*told), key=lambda event: (event.subject, -event.size))
+
+
+def note_step(run: SteppedScene, attempt: Attempt) -> bool:
+    """Note what is remarkable about the step just accepted; returns whether it has `events`; collective."""
     when, notes = f"step {run.step_number} ({run.time_text()})", run.run_notes
     with run.phases("balance"):
         note = run.compression.check(when, reported=notes.has("compression"))
@@ -109,14 +120,13 @@ def note_step(run: SteppedScene, attempt: Attempt) -> None:
                 f"at this stiffness, {times:.1g} times the loads"
                 + (doubt if run.scene.time.static and times > DOUBTFUL else ""),
             )
-    equations = run.problem.equations
-    for term in equations.active.telling:
-        told = run.comm.allgather(term.events(equations.x, equations.step.frozen[term]))
-        for subject, text in sorted(event for events in told for event in events):
-            notes.once(subject, f"{when}: {text}")
+    happened = events(run)
+    for event in happened:
+        notes.once(event.subject, f"{when}: {event.text}")
     if run.stepper.solver.stopped_by:
         notes.once(
             "option",
             f"{when}: {run.stepper.solver.stopped_by} stopped Newton's method at a residual of "
             f"{attempt.residual:.2g} N, short of solver.force_tolerance",
         )
+    return bool(happened)

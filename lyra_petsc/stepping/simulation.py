@@ -32,11 +32,11 @@ from lyra_petsc.stepping.newton.force_scales import residual_roundoff
 from lyra_petsc.stepping.problem import Problem, build_problem, event_times
 from lyra_petsc.stepping.recovery import RejectedStep, Trouble, recover
 from lyra_petsc.stepping.resumption import resume, saved_state
-from lyra_petsc.stepping.run_notes import RunNotes, note_of_repeats, note_step
+from lyra_petsc.stepping.run_notes import RunNotes, events, note_of_repeats, note_step
 from lyra_petsc.stepping.start_notes import nothing_acts
 from lyra_petsc.stepping.statics.equilibrium import Equilibrium
 from lyra_petsc.stepping.statics.stability import Stability
-from lyra_petsc.stepping.step_control import ToleranceControl
+from lyra_petsc.stepping.step_control import LoadControl, ToleranceControl
 from lyra_petsc.stepping.step_plan import planned_control
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.term_states import ElementState
@@ -147,8 +147,8 @@ class SteppedScene:
         self.notes.extend(on_root(self.comm, lambda: unknown(self.stepper.our_options)))
         self.roundoff = floor
         self.max_steps = self.stepper.solver.ts.getMaxSteps()
-        events = [*event_times(scene), *kink_times(scene)]
-        self.control = planned_control(scene, self.stepper.solver.ts, [*events, *self._stops])
+        changes = [*event_times(scene), *kink_times(scene)]
+        self.control = planned_control(scene, self.stepper.solver.ts, [*changes, *self._stops])
         self.accuracy: Accuracy | None = None
         if isinstance(self.control, ToleranceControl):
             self.accuracy = Accuracy(equations, self.control, scene.time.tolerance or 0.0, whole.size)
@@ -167,7 +167,7 @@ class SteppedScene:
             if isinstance(term, Dissipates):  # whose rest state has edges in equilibrium
                 term.initialise(equations.x)
         start = equations.here()
-        self.notes.extend(nothing_acts(scene, start, events, self.control.end, floor))
+        self.notes.extend(nothing_acts(scene, start, changes, self.control.end, floor))
         self.equilibrium: Equilibrium | None = None
         if scene.time.static:
             sizes = whole.spacing, whole.size, floor, self.control.end
@@ -243,7 +243,8 @@ class SteppedScene:
         if self.accuracy is not None:
             self.accuracy.record_step(v_owned, dt, self.step_number, self.time, self.run_notes)
         equations.follow_step(v_owned)
-        if self.equilibrium is not None and self.control.is_end(end):
+        self.control.record_success(newton)
+        if self.equilibrium is not None and self.control.is_end(end) and not events(self):
             with self.phases("solve"):
                 settled = self.equilibrium.settle(self.time, end)
             newton += settled.newton_iterations
@@ -251,14 +252,15 @@ class SteppedScene:
             self.stability = settled.stability.content
             if settled.note:
                 self.notes.append(settled.note)
-        self.control.record_success(newton)
         self.time, self.step_number = end, self.step_number + 1
         if self.guard is None:
             with self.phases("balance"):
                 self.energy_balance.record(x_before[: len(v_owned)])
-        note_step(self, attempt)
+        changed = note_step(self, attempt)
         for term in equations.active.stateful:
             term.accept(equations.x, equations.step.frozen[term])
+        if changed:
+            self._take_up_changes()
         equations.reference.record_starts(self.time, equations.x)
         self.stepper.monitor()
         seconds = clock.perf_counter() - COMPILATION.seconds - started
@@ -267,6 +269,16 @@ class SteppedScene:
             self.totals[name] += int(number)
         stretch = self.compression.smallest, self.compression.largest
         return StepReport(self.step_number, self.time, dt, *took, *stretch, attempt.remaining)
+
+    def _take_up_changes(self) -> None:
+        """Something has changed in terms at the end of the step: forces jump there."""
+        self.problem.equations.state.forget()
+        if self.equilibrium is None:
+            self.expect_jump(self.time)
+        else:
+            assert isinstance(self.control, LoadControl)
+            self.control.stay()
+            self.equilibrium.forget_path()
 
     def _trouble(self, attempt: Attempt, x_before: Array, v_before: Array, dt: float) -> Trouble | None:
         """Why the attempt at a step of dt [s] from x_before and v_before (n_local, 3) is not accepted."""
@@ -321,7 +333,7 @@ class SteppedScene:
 
     @property
     def jumps(self) -> tuple[float, ...]:
-        """Times [s] of the jumps that a program makes."""
+        """Times [s] of the jumps of forces that the scene does not name."""
         return self.problem.equations.start_acceleration.jumps
 
     def expect_jump(self, time: float) -> None:

@@ -49,7 +49,7 @@ class StartAcceleration:
     starts_anew : bool
         Whether the integrator began the step from accelerations computed at its start.
     jumps : tuple of float
-        Times [s] of the jumps that a program makes.
+        Times [s] of the jumps that the scene does not name: by a program, or by what breaks.
     """
 
     starts_anew = False

@@ -253,7 +253,14 @@ class LoadControl(StepControl):
 
     ``step`` is the first increment and the largest one after an event, ``largest`` the largest of all;
     ``factor`` may exceed 1.
+
+    Attributes
+    ----------
+    stays : bool
+        Whether the next step is without an increment, as something has broken at the last equilibrium.
     """
+
+    stays = False
 
     EASY = 12
     """Newton iterations of a load step after which the next is twice as large."""
@@ -265,10 +272,35 @@ class LoadControl(StepControl):
         self._largest = largest
 
     def next_end(self, time: float) -> float:
+        if self.stays:
+            return time
         if time in self._events:  # motions and loads may turn here, and with them the path of equilibria
             self.factor = min(self.factor, 1.0)
         return super().next_end(time)
 
+    def is_end(self, time: float) -> bool:
+        return not self.stays and super().is_end(time)
+
+    def can_halve(self) -> bool:
+        return not self.stays and super().can_halve()
+
+    def writes_at(self, time: float) -> bool:
+        return not self.stays and super().writes_at(time)
+
+    def stay(self) -> None:
+        """Let the next step be without an increment."""
+        self.stays, self.factor = True, min(self.factor, 1.0)
+
     def record_success(self, iterations: int) -> None:
+        if self.stays:
+            self.stays = False
+            return
         larger = 2.0 * self.factor if iterations <= self.EASY else self.factor
         self.factor = min(larger, self._largest / self.step)
+
+    def saved_state(self) -> dict[str, float]:
+        return super().saved_state() | {"stays": self.stays}
+
+    def restore(self, saved: Mapping[str, float]) -> None:
+        super().restore(saved)
+        self.stays = bool(saved.get("stays"))

@@ -18,7 +18,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.attached_points import attached_points
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.protocols import Dissipates, Place, TellsEvents, TermState, WritesTable
+from lyra_petsc.terms.protocols import Dissipates, Event, Place, TellsEvents, TermState, WritesTable
 from lyra_petsc.terms.rest import RestShape
 
 
@@ -99,13 +99,14 @@ class AttachmentSprings(Dissipates, TellsEvents, WritesTable):
         gone = self._breaks(tension)[: self.n_owned]
         return float(np.sum((0.5 * tension**2 / self._k)[: self.n_owned][gone]))
 
-    def events(self, x: Array, frozen: Any = None) -> list[tuple[str, str]]:
+    def events(self, x: Array, frozen: Any = None) -> list[Event]:
         tension = self._springs(x)[2]
         gone = np.flatnonzero(self._breaks(tension)[: self.n_owned])
         force, number = np.abs(tension[gone]), self._number[gone]
         largest = {n: force[number == n].max() for n in np.unique(number).tolist()}
         return [
-            (f"attachment {n}", f"attachments[{n}] breaks at {force:.4g} N") for n, force in largest.items()
+            Event(f"attachment {n}", force, f"attachments[{n}] breaks at {force:.4g} N")
+            for n, force in largest.items()
         ]
 
     def state(self) -> dict[str, TermState]:

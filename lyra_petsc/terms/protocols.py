@@ -133,14 +133,28 @@ class Yields(Dissipates):
         """The same term, but all elements at their limits, to `AT_LIMIT`, yield, or else all unload."""
 
 
+class Event(NamedTuple):
+    """What happens to elements of a term at the end of a step.
+
+    Attributes
+    ----------
+    subject : str
+        Notes tell of each subject the first event, and of several in one step that of the largest size.
+    size : float
+    text : str
+    """
+
+    subject: str
+    size: float
+    text: str
+
+
 class TellsEvents(Stateful):
     """An energy with events of which the user should know, such as that a spring breaks."""
 
     @abstractmethod
-    def events(self, x: Array, frozen: Any) -> list[tuple[str, str]]:
-        """Subject and text of each event among the owned elements when the step to x is accepted, called
-        before `accept`; notes tell the first one of each subject.
-        """
+    def events(self, x: Array, frozen: Any) -> list[Event]:
+        """The events among the owned elements when the step to x is accepted, called before `accept`."""
 
 
 class LimitsStep(Elastic):

@@ -12,7 +12,7 @@ from oracle import differences, gradient
 from physics import CLOTH, Simulation, finished, grid, scene_of, shape, stepped
 from pydantic import ValidationError
 
-from lyra_petsc.errors import InputError
+from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.mesh.attached_points import attached_points
 from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.output.read_run import StoredRun
@@ -94,12 +94,31 @@ def pulled(integrator: str, factor: float) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("factor", [0.99, 1.01])
-def test_a_spring_breaks_in_statics(factor: float) -> None:
-    scene = hanging(breaks_at=WEIGHT * factor)
-    with finished(MPI.COMM_SELF, scene, **SOLVER) as simulation:
-        broken = [note for note in simulation.notes if "attachments[0] breaks at" in note]
-        assert len(broken) == (factor < 1.0)
+@pytest.mark.parallel
+@pytest.mark.parametrize("breaks_at", [0.5 * 1.01, 0.5 * 0.99, 0.25])
+def test_load_goes_to_what_is_whole_in_statics(comm: MPI.Comm, breaks_at: float) -> None:
+    """Of two springs under a plate of half the weight each, one breaks under the last load or before."""
+    scene = hanging()
+    places = [{"nodes": [12]}, {"nodes": [14]}]
+    scene["attachments"] = [
+        {"from": place, "to": TOP, "stiffness": 40.0, "length": "start"} for place in places
+    ]
+    scene["attachments"][0]["breaks_at"] = breaks_at * WEIGHT
+    scene["handles"] = [{"group": "top"}, {"group": "bottom", "axes": ["x", "y"]}]
+    with finished(comm, scene, **SOLVER) as simulation:
+        x, holds = simulation.problem.equations.x, breaks_at > 0.5
+        first, second = springs(simulation).table_rows(x)
+        assert (first[1], second[1]) == (float(holds), 1.0)
+        np.testing.assert_allclose(
+            [first[-1], second[-1]], np.array([0.5, 0.5] if holds else [0, 1]) * WEIGHT, rtol=1e-6
+        )
+
+
+def test_what_falls_after_a_break_ends_a_static_analysis_in_words() -> None:
+    scene = hanging(breaks_at=0.99 * WEIGHT)
+    message = r"load factor 1\) did not converge after what has broken"
+    with pytest.raises(SolverError, match=message), finished(MPI.COMM_SELF, scene, **SOLVER):
+        pass
 
 
 def test_the_energy_of_a_broken_spring_is_heat() -> None:
@@ -246,3 +265,22 @@ def test_a_resumed_run_has_the_same_springs(comm: MPI.Comm, shared_tmp: Path) ->
         np.testing.assert_allclose(table["tension"][-2:], [row[-1] for row in rows], rtol=1e-12)
         assert rows[0][1] < 3
         np.testing.assert_allclose(again, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_plate_falls_freely_after_its_spring_breaks(integrator: str) -> None:
+    """In the steps after the break no force of the spring is left, in no history of an integrator."""
+    scene = hanging(breaks_at=0.6 * WEIGHT) | {
+        "handles": [{"group": "top"}, {"group": "bottom", "axes": ["x", "y"]}],
+        "time": {"end": 0.3, "step": 0.005, "integrator": integrator},
+    }
+    with stepped(MPI.COMM_SELF, scene, **SOLVER) as simulation:
+        while not springs(simulation).broken.any():
+            simulation.step()
+        equations, start = simulation.problem.equations, simulation.time
+        assert 0.01 < start < 0.1
+        before = equations.v[9:, 2]
+        for _ in range(4):
+            simulation.step()
+        change = np.average(equations.v[9:, 2] - before, weights=equations.mass[9:])
+        assert change == pytest.approx(-10.0 * (simulation.time - start), rel=1e-6)

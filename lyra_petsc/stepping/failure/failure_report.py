@@ -108,8 +108,9 @@ class Failure:
                 f" ({self.diagnosis.kind}); last residual {self.diagnosis.norm:.3g} N, worst at "
                 f"{self._vertex()} around {_point(vertex.before, 4)} m, mostly {vertex.largest_force}"
             )
+        how = f"even with {self._length(last)}" if last.dt > 0.0 else "after what has broken"
         return (
-            f"step {self.step} ({start}) did not converge even with {self._length(last)}: {cause}; "
+            f"step {self.step} ({start}) did not converge {how}: {cause}; "
             f"the state at {start} is kept; try {self.advice[0]}"
         )
 
@@ -243,11 +244,11 @@ def explain_failure(
         near = report.nearest(refused)
         obstacle = report.nearest_obstacle() if near is not None and not near.obstacle else None
     static, kind = not equations.integrator.dynamic, diagnosis.kind
-    shorter = (
-        "a smaller time.step (first increment of the load), or a damped motion instead"
-        if static
-        else f"a smaller time.step, or -ts_adapt_dt_min below {attempts[-1].dt:.3g}"
-    )
+    shorter = f"a smaller time.step, or -ts_adapt_dt_min below {attempts[-1].dt:.3g}"
+    if static:
+        shorter = "a smaller time.step (first increment of the load), or a damped motion instead"
+    if attempts[-1].dt == 0.0:
+        shorter = "a damped motion instead (without analysis: static)"
     advice = [f"a smaller {solver.stopped_by}, or none"] if solver.stopped_by else []
     if near is not None and near.blocks:
         # contact forces grow without bounds where parts would cross, so other advice would mislead

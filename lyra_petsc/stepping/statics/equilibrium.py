@@ -363,6 +363,10 @@ class Equilibrium:
         step, note = (before, factor), self._friction.note
         return descend(self._equations, step, self._size, attempt, skew_part_stabilises, note)
 
+    def forget_path(self) -> None:
+        """Predict no shape from the equilibria so far: something has changed."""
+        self._prediction.forget()
+
     def saved_state(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint at the equilibrium at ``factor``; collective."""
         arrays, past = self._prediction.saved_state(factor)

@@ -41,9 +41,13 @@ class PathPrediction:
     ) -> None:
         self._equations, self._response, self._spacing = equations, tangent, spacing
         self._whole_stiffness = whole_stiffness
-        self._extrapolation = Extrapolation(equations.points.comm)
+        self.forget()
         # load factor λ of the last equilibrium, change of the loads over that of λ [N], and dx/dλ [m]
         self._last_factor, self._load_rate = 0.0, np.zeros((equations.points.n_owned, 3))
+
+    def forget(self) -> None:
+        """Predict nothing from the equilibria so far."""
+        self._extrapolation = Extrapolation(self._equations.points.comm)
         self._tangent: Array | None = None
 
     def record(self, factor: float) -> None:
@@ -57,7 +61,7 @@ class PathPrediction:
 
     def along_tangent(self, before: float, factor: float) -> list[Array]:
         """Displacements (n_owned, 3) [m] along the tangent, at the start of a load step."""
-        if before != self._last_factor:
+        if before != self._last_factor or factor == before:
             return []
         self._load_rate = self._equations.out_of_balance() / (factor - before)
         if self._tangent is None:
@@ -75,7 +79,7 @@ class PathPrediction:
         positions ``start`` (n_owned, 3) [m].
         """
         equations, n, step = self._equations, len(start), factor - before
-        if equations.near:
+        if equations.near or step == 0.0:
             return 0  # the first guess is another
         moved = np.where(equations.step.prescribed.free, 0.0, equations.x[:n] - start)
         (largest,) = equations.points.global_max(float(np.abs(moved).max(initial=0.0)))
