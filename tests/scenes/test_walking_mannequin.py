@@ -1,4 +1,4 @@
-"""A skirt on a mannequin of 20,000 triangles that walks 120 frames: nothing crosses, and it takes its time."""
+"""A skirt on a mannequin of 20,000 triangles that walks 120 frames: crossings, and the time it takes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WAIT = 1.2
 
 
 def worn(scene: Scene) -> tuple[float, int]:
-    """CPU time [s] of the steps after `WAIT`, and the number of states with crossings, of one in four steps."""
+    """CPU time [s] of the steps after `WAIT`, and the number of states with crossings, of every fourth."""
     seconds, crossed = 0.0, 0
     with stepped(MPI.COMM_SELF, scene) as simulation:
         mesh = simulation.problem.mesh
