@@ -243,7 +243,7 @@ class EnergyBalance:
         self.damping, self._stage = forces.heat.take(self._at), None
         if equations.integrator.order > 1 or not equations.integrator.dynamic:
             self._stage = forces
-            if self._last and not equations.start_acceleration.starts_anew:
+            if self._last and step.dt > 0.0 and not equations.start_acceleration.starts_anew:
                 forces = forces.at_middle(step.dt, self._last)
         if not step.ends_at_stage and (equations.active.moving or equations.active.external):
             equations.change(
