@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.contact.contact_setup import AREA_UNITS, Barrier
+from lyra_petsc.contact.contact_setup import AREA_UNITS, MAX_NARROWING, Barrier
 from lyra_petsc.contact.joined import JoinedVertices
 from lyra_petsc.contact.obstacle_points import Obstacles
 from lyra_petsc.contact.obstacle_search import ObstacleSearch
@@ -22,6 +22,10 @@ EDGE_GAP = 0.3
 lie on each other are kept apart by pairs of vertices and triangles, two for each vertex; pairs of edges, of
 which there are ten times as many, are needed only for what these miss. The same holds for edges and points of
 obstacles' smooth surfaces, so that forces on the vertices of a sheet do not depend on the obstacle's mesh."""
+
+OF_THREAD = 0.5
+"""Gap between two parts that an open seam is to join, over the length of its thread, where this is less than
+the gap: they close without passing each other, as contact leaves them out only then."""
 
 SKIN = 0.5
 """Distance over the gap by which points may approach each other between two searches."""
@@ -55,15 +59,15 @@ class ContactSearch:
         Distance [m] within which pairs are found, the skin included.
     approach_limit : float
         Distance [m] by which two points that were not found may approach each other.
-    obstacles_have_moved : bool
-        Whether pairs must be searched again, since obstacles are elsewhere.
+    outdated : bool
+        Whether pairs must be searched again, since obstacles are elsewhere, or threads of seams shorter.
     """
 
     def __init__(self, surface: NDArray[np.int32], uv: Array, marks: Ints) -> None:
         self.surface: NDArray[np.int32] = np.ascontiguousarray(surface, dtype=np.int32)
         self.marks = marks
         self._sheets = SheetSearch(surface.astype(np.int64), uv)
-        self.obstacles, self.obstacles_have_moved = Obstacles([]), False
+        self.obstacles, self.outdated = Obstacles([]), False
         self._obstacle_search = ObstacleSearch(self.obstacles, self._sheets, 0.0)
         self._searched: Ints | None = None  # triangles that the search has
         self._vertex_units = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
@@ -96,13 +100,14 @@ class ContactSearch:
         return self._obstacle_search.deviations
 
     def expect(self, start: float, end: float) -> None:
-        """Take the motion of the obstacles in a step between two times [s]."""
+        """Take the motion of the obstacles, and the threads of seams, in a step between two times [s]."""
+        self.outdated = self._joined.expect(end, self._gap / OF_THREAD)
         if not self.obstacles.moving:
             return
         self._next_obstacle_x = np.stack([self.obstacles.positions(time) for time in (start, end)])
         largest = np.linalg.norm(self._next_obstacle_x - self.obstacle_x, axis=-1).max(initial=0.0)
         planes = (self.obstacles.planes[:, 3] < self.obstacles.first_wall).any()
-        self.obstacles_have_moved = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
+        self.outdated |= bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
         self._obstacle_search.deviations = self.obstacles.path_deviations(start, end)
 
     def near_pairs(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> NearPairs | None:
@@ -114,7 +119,7 @@ class ContactSearch:
         """
         if self.obstacles.moving:
             self._obstacle_search.move(self._next_obstacle_x)
-        self.obstacles_have_moved = False
+        self.outdated = False
         if triangles is not self._searched:
             self._sheets.set_triangles(x, numbers, triangles[:, :3], triangles[:, 3])
             self._vertex_units = np.full(len(x) + 1, AREA_UNITS)  # the last one for other pairs
@@ -132,7 +137,7 @@ class ContactSearch:
         if dx.any() and not self._static:
             limit = max(MAX_PAIRS, MAX_PAIRS_PER_VERTEX * len(x))
         boxes = self._sheets.boxes(x, dx)
-        parts = [np.empty((0, 7), dtype=np.int64)]
+        parts, narrowed = [np.empty((0, 7), dtype=np.int64)], np.empty(0, dtype=np.int64)
         if self.obstacles.bodies:
             parts += self._obstacle_search.pairs(x, dx, boxes, self._walled)
         if self._of_sheets:
@@ -141,7 +146,8 @@ class ContactSearch:
             pairs = self._sheets.pairs(x, dx, numbers, radius, edge_radius, boxes, limit)
             if pairs is None:
                 return None
-            parts.append(self._without_seams(pairs, numbers))
+            pairs, narrowed = self._without_seams(pairs, numbers)
+            parts.append(pairs)
         every = np.concatenate(parts)
         if len(every) > limit:
             return None
@@ -156,20 +162,28 @@ class ContactSearch:
             edges = np.flatnonzero(kind == EDGE_EDGE)
             units[edges] >>= self._symmetry_planes(x, points[edges])
         narrowing = np.where(obstacle < 0, self._narrowing[np.maximum(points, 0)].max(axis=1), AREA_UNITS)
+        if len(narrowed):
+            narrowing[-len(narrowed) :] = np.maximum(narrowing[-len(narrowed) :], narrowed)
         vertices = numbers[np.where(sheet, points, first[:, None])]
         obstacle_points = np.where(sheet, 0, points)
         return NearPairs(vertices, kind, obstacle, obstacle_points, every[:, 6], units, narrowing)
 
-    def _without_seams(self, pairs: Ints, numbers: Ints) -> Ints:
-        """The rows of `SheetSearch.pairs` without those between parts that a seam holds together."""
+    def _without_seams(self, pairs: Ints, numbers: Ints) -> tuple[Ints, Ints]:
+        """The rows of `SheetSearch.pairs` without those between parts that a closed seam holds together, and
+        the narrowing of the others by seams; none where there are no seams.
+        """
         if not self._joined:
-            return pairs
+            return pairs, np.empty(0, dtype=np.int64)
+        narrowing = np.full(len(pairs), AREA_UNITS)
         points = numbers[pairs[:, 2:6]]
         rows = self._joined.concern(points)
-        held = self._joined.between(points[rows], points[rows])
-        of_edges, of_vertex = held[:, :2, 2:].any(axis=(1, 2)), held[:, 0, 1:].any(axis=1)
-        left_out = np.where(pairs[rows, 0] == EDGE_EDGE, of_edges, of_vertex)
-        return np.delete(pairs, rows[left_out], axis=0)
+        lengths = self._joined.lengths(points[rows], points[rows])
+        of_edges, of_vertex = lengths[:, :2, 2:].min(axis=(1, 2)), lengths[:, 0, 1:].min(axis=1)
+        length = np.where(pairs[rows, 0] == EDGE_EDGE, of_edges, of_vertex)
+        closed = length * MAX_NARROWING <= self._gap
+        least = np.maximum(length[~closed] * OF_THREAD, self._gap / MAX_NARROWING)
+        narrowing[rows[~closed]] = np.rint(AREA_UNITS * np.maximum(self._gap / least, 1.0))
+        return np.delete(pairs, rows[closed], axis=0), np.delete(narrowing, rows[closed])
 
     def _symmetry_planes(self, x: Array, points: Ints) -> Ints:
         """Number of symmetry planes in which all vertices of pairs of edges ``points`` (m, 4) lie, (m,)."""

@@ -1,6 +1,10 @@
-"""Vertices that seams hold together without making them one: contact leaves out pairs of their parts."""
+"""Vertices that seams hold together without making them one: contact leaves out pairs of their parts once
+the seam is closed, and keeps them apart by less and less before.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -13,19 +17,22 @@ there are judged: they meet at the seam, up to its gap, and the sag of a curved 
 
 
 class JoinedVertices:
-    """Which vertices are held together.
+    """Which vertices are held together, and by threads of which lengths.
 
     Parameters
     ----------
     pairs : (n, 2) int64
-        Numbers of vertices.
+        Numbers of vertices; of a pair that several threads hold together the longest one counts.
+    lengths : callable or None
+        Lengths (n,) [m] of the threads of the pairs at a time [s]; without it the threads have none.
     """
 
-    def __init__(self, pairs: Ints) -> None:
+    def __init__(self, pairs: Ints, lengths: Callable[[float], Array] | None = None) -> None:
         both = np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64)
         self._span = int(both.max(initial=-1)) + 1
-        self._keys = np.unique(both[:, 0] * self._span + both[:, 1])
+        self._keys, self._place = np.unique(both[:, 0] * self._span + both[:, 1], return_inverse=True)
         self._vertices = np.unique(both)
+        self._lengths_at, self._length = lengths, np.zeros(len(self._keys))
 
     def __bool__(self) -> bool:
         return len(self._keys) > 0
@@ -34,15 +41,34 @@ class JoinedVertices:
         """The rows of ``vertices`` (n, p) with any vertex that is held."""
         return np.flatnonzero(np.isin(vertices, self._vertices).any(axis=1))
 
+    def expect(self, time: float, longest: float) -> bool:
+        """Take the threads' lengths at a time [s], ``longest`` [m] where they are longer; returns whether any
+        has changed.
+        """
+        if self._lengths_at is None or not self:
+            return False
+        lengths, before = np.minimum(self._lengths_at(time), longest), self._length
+        self._length = np.zeros(len(self._keys))
+        np.maximum.at(self._length, self._place, np.concatenate([lengths, lengths]))
+        return not np.array_equal(self._length, before)
+
+    def lengths(self, first: Ints, second: Ints) -> Array:
+        """Lengths [m] of the threads between each vertex of rows ``first`` (n, p) and each of ``second``
+        (n, q), (n, p, q); infinite where there is none.
+        """
+        one, other = np.broadcast_arrays(first[:, :, None], second[:, None, :])
+        if not len(self._keys):
+            return np.full(one.shape, np.inf)
+        known = (one < self._span) & (other < self._span)
+        key = np.where(known, one * self._span + other, -1)
+        at = np.minimum(np.searchsorted(self._keys, key), len(self._keys) - 1)
+        return np.where(known & (self._keys[at] == key), self._length[at], np.inf)
+
     def between(self, first: Ints, second: Ints) -> Mask:
         """Whether each vertex of rows ``first`` (n, p) is held together with each of ``second`` (n, q),
         (n, p, q).
         """
-        one, other = np.broadcast_arrays(first[:, :, None], second[:, None, :])
-        known = (one < self._span) & (other < self._span)
-        key = np.where(known, one * self._span + other, -1)
-        at = np.minimum(np.searchsorted(self._keys, key), max(len(self._keys) - 1, 0))
-        return np.asarray(known & (self._keys[at] == key)) if len(self._keys) else known & False
+        return np.asarray(np.isfinite(self.lengths(first, second)))
 
 
 def crossings_beside_seams(points: Array, triangles: Ints, tied: Ints) -> Ints:

@@ -124,7 +124,7 @@ class PairSearch:
         positions = (here,) if expected is None else (here, here + expected[: len(here)])
         leaves, moved, changed = layout.global_max(
             not self._are_near_path(self._radius, *positions),
-            barrier.search.obstacles_have_moved,
+            barrier.search.outdated,
             friction is not None and friction.pairs_have_changed,
         )
         searches = leaves or moved

@@ -36,12 +36,13 @@ def set_up_terms(
     barrier: Barrier,
     obstacles: Sequence[Solid | Container],
     tied: Ints,
+    lengths: Callable[[float], Array],
 ) -> None:
     """Give the terms of a scene with contact the data that are the same on all ranks; ``tied`` (n, 2) are
-    the global numbers of vertices that are held together.
+    the global numbers of vertices that are held together, ``lengths`` (n,) [m] their threads' at a time [s].
     """
     contact = cast(ContactBarrier, terms["contact"])
-    contact.set_up(barrier, obstacles, JoinedVertices(tied))
+    contact.set_up(barrier, obstacles, JoinedVertices(tied, lengths))
     if "friction" in terms:
         cast(CoulombFriction, terms["friction"]).set_up(contact)
 

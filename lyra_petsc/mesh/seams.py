@@ -7,6 +7,7 @@ straight and evenly stretched: between common points both are linear, so each ti
 
 from __future__ import annotations
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -91,10 +92,23 @@ class Ties(NamedTuple):
         w = self.weight[:, None]
         return np.asarray(vertex - (1.0 - w) * first - w * second)
 
-    def pairs(self) -> Ints:
-        """Pairs of vertices (m, 2) that the ties hold together."""
-        at = self.stencil
-        return np.concatenate([at[:, :2], at[self.weight > 0.0][:, ::2]])
+
+class Threads(NamedTuple):
+    """What holds pairs of vertices together; of a pair that several threads join, one after another, each.
+
+    Attributes
+    ----------
+    pairs : (n, 2) int64
+        Vertices.
+    seam : (n,) int64
+        Number of the thread's seam.
+    length : (n,) float64
+        Length [m] of the thread at the start.
+    """
+
+    pairs: Ints
+    seam: Ints
+    length: Array
 
 
 class SewnCurves(NamedTuple):
@@ -300,7 +314,42 @@ def join_seams(scene: Scene, mesh: Mesh) -> Mesh:
 
 def tied_pairs(scene: Scene, mesh: Mesh) -> Ints:
     """Pairs of vertices (n, 2) that the seams of a scene hold together, of the mesh from `join_seams`."""
-    return np.concatenate([sewn.ties.pairs() for sewn in sewn_curves(scene, mesh)])
+    return threads(scene, mesh).pairs
+
+
+def threads(scene: Scene, mesh: Mesh) -> Threads:
+    """The threads of a scene's seams, of the mesh from `join_seams`.
+
+    Where seams meet, vertices at one place are held together by the threads between others there, too.
+    """
+    sewn = [one.ties for one in sewn_curves(scene, mesh)]
+    ties = Ties(*(np.concatenate(arrays) for arrays in zip(*sewn, strict=True)))
+    seam = np.repeat(np.arange(len(sewn)), [len(one.share) for one in sewn])
+    length = np.linalg.norm(ties.gaps(mesh.positions), axis=1)
+    to_vertex = np.flatnonzero(ties.weight == 0.0)
+    place = connected_components(mesh.n_vertices, ties.stencil[to_vertex, :2])
+    vertices_at: dict[int, list[int]] = {}
+    for vertex in np.unique(ties.stencil).tolist():
+        vertices_at.setdefault(int(place[vertex]), []).append(vertex)
+    threads_at: dict[int, list[int]] = {}
+    for tie in to_vertex.tolist():
+        threads_at.setdefault(int(place[ties.stencil[tie, 0]]), []).append(tie)
+    rows = [
+        (vertex, end, tie)
+        for tie, (vertex, *edge) in enumerate(ties.stencil.tolist())
+        for end in (edge if ties.weight[tie] > 0.0 else edge[:1])
+    ]
+    direct = {frozenset(pair) for *pair, _ in rows}
+    for vertex, end, tie in rows.copy():
+        here, there = int(place[vertex]), int(place[end])
+        between = {tie, *threads_at.get(here, ()), *threads_at.get(there, ())}
+        if here == there and tie != min(between):
+            continue  # all pairs there are those of its first thread
+        for one, other in product(vertices_at[here], vertices_at[there]):
+            if one != other and frozenset((one, other)) not in direct:
+                rows += [(one, other, thread) for thread in sorted(between)]
+    every = np.array(rows, dtype=np.int64).reshape(-1, 3)
+    return Threads(every[:, :2], seam[every[:, 2]], length[every[:, 2]])
 
 
 def seam_hinges(scene: Scene, mesh: Mesh, hinges: Hinges) -> SeamHinges:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -234,7 +234,10 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
         if of_term is not None:
             elements[entry.name] = of_term
     if len(mesh.tied):
-        elements[TIED] = Elements(mesh.tied)
+        from lyra_petsc.mesh.seams import threads  # with seams only
+
+        pairs, seam, length = threads(scene, mesh)
+        elements[TIED] = Elements(pairs, {"seam": seam.astype(np.float64), "length": length})
     spacing = mean_edge_length(mesh)
     largest = float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max()))
     check_resolved(spacing, largest, scene)
@@ -419,14 +422,33 @@ def _set_up_contact(
     from lyra_petsc.contact.scene_contact import set_up_terms
     from lyra_petsc.mesh.obstacles import build_scene_obstacles
 
+    obstacles = build_scene_obstacles(part.layout.comm, scene, mesh, Motion)
+    set_up_terms(terms, whole.barrier, obstacles, *_tied_vertices(scene, part))
+
+
+def _tied_vertices(scene: Scene, part: LocalMesh) -> tuple[Ints, Callable[[float], Array]]:
+    """Pairs (n, 2) of global numbers of vertices that seams hold together, on all ranks, and the lengths (n,)
+    [m] of their threads at a time [s]; collective.
+    """
     layout, tied = part.layout, part.elements.get(TIED)
-    pairs = [np.empty((0, 2), dtype=np.int64)]
-    if scene.seams:
-        pairs += layout.comm.allgather(
-            layout.global_number[tied.stencil[: tied.n_owned]] if tied is not None else pairs[0]
+    if not scene.seams:
+        return np.empty((0, 2), dtype=np.int64), lambda time: np.empty(0)
+    from lyra_petsc.terms.seam import closed_part  # with seams only
+
+    own = np.empty((0, 4))
+    if tied is not None:
+        n = tied.n_owned
+        own = np.column_stack(
+            [layout.global_number[tied.stencil[:n]], tied.data["seam"][:n], tied.data["length"][:n]]
         )
-    obstacles = build_scene_obstacles(layout.comm, scene, mesh, Motion)
-    set_up_terms(terms, whole.barrier, obstacles, np.concatenate(pairs))
+    every = np.concatenate(layout.comm.allgather(own))
+    pairs, seam, length = every[:, :2].astype(np.int64), every[:, 2].astype(np.int64), every[:, 3]
+
+    def lengths(time: float) -> Array:
+        still_open = np.array([1.0 - closed_part(one, time) for one in scene.seams])
+        return np.asarray(still_open[seam] * length)
+
+    return pairs, lengths
 
 
 def _scene_contact(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, finished, scene_of, shape
+from physics import CLOTH, finished, scene_of, shape, stepped
 
 import lyra_petsc
 from lyra_petsc.contact.joined import crossings_beside_seams
@@ -138,6 +138,42 @@ def test_panels_fold_onto_each_other_with_contact(comm: MPI.Comm) -> None:
         back = x[mesh.groups["back/right"].vertices]
         assert (back[:, 0] < -0.15).all()
         assert simulation.energy_balance.columns()["contacts"] > 0
+
+
+def test_sides_of_a_closing_seam_do_not_pass_each_other(comm: MPI.Comm) -> None:
+    """Two panels above each other are sewn along their near sides, which swing towards each other."""
+    content = panels(5, 6, 0.05, {"close": {"until": 0.2}}, contact={"gap": 0.01})
+    content["mesh"][1]["transform"] = {"translate": [0.15, 0.0, 0.05]}
+    content["time"] = {"end": 0.3, "step": 0.005}
+    mesh = build_scene_mesh(scene_of(content))
+    with stepped(comm, scene_of(content)) as simulation:
+        while not simulation.finished:
+            simulation.step()
+            closed = simulation.time > 0.2 - 1e-9
+            tied = mesh.tied if closed else mesh.tied[:0]
+            assert len(crossings_beside_seams(shape(simulation), mesh.triangles, tied)) == 0
+        term, here = simulation.problem.terms["seam"], simulation.problem.equations.here()
+        assert isinstance(term, SeamThreads)
+        ((_, gap, *_),) = term.table_rows(here.x, here.frozen[term])
+    assert gap < 1e-4 * 0.2 / 6
+
+
+def test_corners_that_meet_through_other_seams_do_not_repel_each_other(comm: MPI.Comm) -> None:
+    """Four squares around a corner, each sewn to two others."""
+    places = {"a": (0.0, 0.0), "b": (0.21, 0.0), "c": (0.0, 0.21), "d": (0.21, 0.21)}
+    content = panels(4, 4, 0.0, {}, contact={"gap": 0.01})
+    grid = content["mesh"][0]["grid"]
+    content["mesh"] = [
+        {"name": name, "grid": grid, "transform": {"translate": [*at, 0.0]}} for name, at in places.items()
+    ]
+    sides = ("a/right", "b/left"), ("a/top", "c/bottom"), ("b/top", "d/bottom"), ("c/right", "d/left")
+    content["seams"] = [{"between": pair} | CLOSING for pair in sides]
+    with finished(comm, content) as simulation:
+        term, here = simulation.problem.terms["seam"], simulation.problem.equations.here()
+        assert isinstance(term, SeamThreads)
+        gaps = [row[1] for row in term.table_rows(here.x, here.frozen[term])]
+        assert max(map(float, gaps)) < 1e-4 * 0.2 / 4
+        assert simulation.energy_balance.columns()["contacts"] == 0
 
 
 @pytest.mark.parametrize("stiffness", ["rigid", 1e4])
