@@ -30,9 +30,9 @@ def run_of(comm: MPI.Comm, folder: Path, name: str, *settings: str) -> StoredRun
     if comm.rank > 0:
         return None
     run = StoredRun(folder / "run")
-    obstacles = run_obstacles(run)
+    obstacles, tied = run_obstacles(run), run_ties(run)
     for state in range(len(run)):
-        pairs, at_corners, overlaps = crossings_of(run, obstacles, state, tied=run_ties(run))
+        pairs, at_corners, overlaps = crossings_of(run, obstacles, state, tied=tied)
         inside = [part for overlap in overlaps.values() for part in overlap]
         assert not any(len(found) for found in (pairs, at_corners, *inside))
     assert np.median(np.asarray(run.history["newton_iterations"])[1:]) <= 20
@@ -134,3 +134,20 @@ def test_a_skirt_is_sewn_and_worn(comm: MPI.Comm, shared_tmp: Path) -> None:
     gap = column(run.seams, "gap")
     assert gap[0] == pytest.approx(0.3)
     assert gap[-2:].max() < 1e-5
+
+
+def test_a_shirt_is_sewn_round_its_wearer_who_carries_it(comm: MPI.Comm, shared_tmp: Path) -> None:
+    settings = ("mesh.size=0.07", "time.step=0.02", "time.end=1.5")
+    if (run := run_of(comm, shared_tmp, "shirt", *settings)) is None:
+        return
+    uv, edge = run.corner_uv, 0.07
+    assert uv is not None
+    one, other = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    area = 0.5 * float(np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum())
+    assert column(run.obstacles, "fz")[-1] == pytest.approx(-0.187 * area * 9.81, rel=5e-3)
+    seams = run.seams
+    assert len(seams[seams["step"] == 0]) == 12
+    closed = seams[seams["time"] >= 1.0]
+    assert closed["gap"].max() < 1e-3 * edge
+    # no seam pulls more than a third of the weight once the shirt hangs
+    assert seams["opening"].iloc[-12:].max() < 0.5

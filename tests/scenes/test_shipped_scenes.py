@@ -36,7 +36,7 @@ SHIPPED = (
     "swing",
     "twisted-strip",
 )
-OF_CONTACT = ("flag-contact", "reef-knot", "skirt", "stack", "tablecloth", "twist")
+OF_CONTACT = ("flag-contact", "reef-knot", "shirt", "skirt", "stack", "tablecloth", "twist")
 """Scenes that ``test_contact_scenes.py`` tests."""
 
 
