@@ -151,3 +151,15 @@ def test_a_shirt_is_sewn_round_its_wearer_who_carries_it(comm: MPI.Comm, shared_
     assert closed["gap"].max() < 1e-3 * edge
     # no seam pulls more than a third of the weight once the shirt hangs
     assert seams["opening"].iloc[-12:].max() < 0.5
+
+
+@pytest.mark.parallel(1)
+def test_a_shirt_that_starts_inside_its_wearer_by_5_mm_is_untangled(comm: MPI.Comm, shared_tmp: Path) -> None:
+    # the front is 5 mm behind the foremost point of the chest, at y = 0.14 m
+    inside = ("contact.untangle=true", "mesh.transform.translate=[0, -0.035, 0]")
+    if (run := run_of(comm, shared_tmp, "shirt", "mesh.size=0.06", "time.end=0.15", *inside)) is None:
+        return
+    start = run.summary["untangled"]
+    assert start["pairs"] > 10
+    assert 0.005 < start["depth"] < 0.009
+    assert start["largest_displacement"] < 0.012
