@@ -3,8 +3,10 @@
 Every work is a force times a displacement, with the force in the middle of the step. Moving targets, or the
 gas in a volume, work by the forces on them, ∂E/∂λ, and the change Δλ of their places, or of its amount: these
 forces, and those of moving obstacles, are the means of both ends. Forces of handles, loads and dampers are
-known at the stage of a step: those in its middle are in line with this stage and the last one. With an
-integrator of first order they are those at the stage, for which backward Euler has the identity::
+known at the stage of a step: those in its middle are in line with this stage and the last one. What handles
+do to accelerate their own vertices is the change of the kinetic energy of these: where velocities of handles
+jump, the force is that of an impact, m Δv / Δt, and force times displacement twice that energy at any Δt.
+With an integrator of first order they are those at the stage, for which backward Euler has the identity::
 
     Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt vᵀ D v + bracket + work of handles, loads and targets
     bracket = E(x_{n+1}, λ_{n+1}) − E(x_n, λ_n) − ∂E/∂x·Δx − ∂E/∂λ·Δλ at n + 1   (≤ 0 where E is convex)
@@ -76,7 +78,7 @@ class StepAccount:
     heat, damping_heat, fabric_heat : float
         Heat of all dampers; of material damping, and of friction within the fabric.
     inertia : float
-        ½ ‖Δv‖²_M of a step of backward Euler, with the velocities that solve it.
+        ½ ‖Δv‖²_M of free coordinates in a step of backward Euler, with the velocities that solve it.
     """
 
     before: Budget
@@ -115,7 +117,8 @@ class WorkingForces:
     Attributes
     ----------
     work, heat : (n_owned, 3)
-        Force [N] of handles, springs, friction and loads without a potential; force of material damping.
+        Force [N] of handles, but for the inertia of their vertices, of springs, friction and loads without a
+        potential; force of material damping.
     ahead : float
         Time [s] from the stage to the end of the step.
     """
@@ -193,6 +196,7 @@ class EnergyBalance:
 
     def measure(self) -> None:
         """Write the energies of the present state into the budget."""
+        self._v = self._equations.v
         entries, self._moving_energy, _ = self._measured(self._equations.here())
         self.budget = replace(self.budget, **entries)
 
@@ -229,6 +233,7 @@ class EnergyBalance:
 
     def enter(self, account: StepAccount) -> None:
         """Take the account of a step that is accepted into the books."""
+        self._v = self._equations.v
         self.budget, self._moving_energy, self._last = account.after, self._moving_at_end, self._stage
 
     def record(self, x_before: Array) -> None:
@@ -251,9 +256,11 @@ class EnergyBalance:
             )
         here = equations.here()
         fabric = sum(term.heat(here.x, here.frozen[term]) for term in equations.active.dissipating)
-        inertia = kinetic_energy(equations.mass, equations.evaluated.v[: len(equations.mass)] - step.v_h)
+        jump = np.where(step.prescribed.free, equations.evaluated.v[: len(step.v_h)] - step.v_h, 0.0)
+        inertia = kinetic_energy(equations.mass, jump)
         works = [_work_of(force, x_before, equations.x) for force in (forces.work, forces.heat)]
         moved = _moved_works(equations, x_before)
+        works[0] += self._kinetic_energy_of_handles(equations.v) - self._kinetic_energy_of_handles(self._v)
         impacts = equations.contact_end.impulses.heat
         del forces  # to save memory
         energies, self._moving_at_end, sums = self._measured(here, *works, *moved, fabric, impacts, inertia)
@@ -268,6 +275,10 @@ class EnergyBalance:
         self.account = StepAccount(before, after, work, at_start, at_end, heat, damped, fabric, inertia)
         return self.account
 
+    def _kinetic_energy_of_handles(self, v: Array) -> float:
+        """½ Σ m v² [J] of this rank's prescribed unknowns, with velocities v (n_local, 3)."""
+        return 0.5 * float(np.vdot(self._equations.mass.take(self._at // 3), np.square(v.take(self._at))))
+
     def _working_forces(self, parts: Iterable[tuple[str, Array]]) -> WorkingForces:
         """From the parts of the residual F at a stage the forces that do work."""
         equations, step = self._equations, self._equations.step
@@ -277,15 +288,17 @@ class EnergyBalance:
         for load in equations.active.loads:
             if load.registration.energy:  # loads with a potential do no external work
                 load.add_force(equations.targets_at(step.at_stage), weight)
-        external = -weight[: equations.points.n_owned]
+        external, inertia = -weight[: equations.points.n_owned], np.zeros(len(at))
         for name, part in parts:
             self._reactions += part.take(at)
             if name in ("loads", "springs", "friction", "wind"):
                 external -= part
             elif name == "damping":
                 damping = part
+            elif name == "inertia":
+                inertia = part.take(at)
             del part  # to save memory before the next part is computed
-        step.prescribed.overwrite(external, external.take(at) + self._reactions)
+        step.prescribed.overwrite(external, external.take(at) + self._reactions - inertia)
         return WorkingForces(external, damping, step.end - step.at_stage)
 
     def saved_state(self) -> tuple[dict[str, Array], dict[str, Any]]:

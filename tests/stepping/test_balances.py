@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, Simulation, finished, grid
+from physics import CLOTH, Simulation, finished, grid, stepped
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import EnergyBalance
@@ -93,13 +93,35 @@ def test_energy_identity_of_backward_euler_in_every_step(comm: MPI.Comm, name: s
             energy_balance.record(x[:n])
             new = energy_balance.budget
             jump = equations.mass[:, None] * (equations.v[:n] - v) ** 2
-            lost = 0.5 * comm.allreduce(float(jump.sum()))
+            lost = 0.5 * comm.allreduce(float(jump.sum(where=equations.step.prescribed.free)))
             heat, work = new.dissipation - old.dissipation, new.external_work - old.external_work
             change = new.total - old.total
             assert change == pytest.approx(-lost - heat + bracket(simulation, x) + work, abs=1e-9 * size)
             assert heat >= 0.0
             if name == "damping":
                 assert heat > 1e-9
+
+
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "alpha2", "bdf2"])
+def test_a_handle_that_starts_at_once_does_the_work_of_its_vertices(comm: MPI.Comm, integrator: str) -> None:
+    # all vertices are held: the work is their kinetic energy, also after further jumps
+    content = BASE | {
+        "initial": {},
+        "handles": [{"box": [[-1, -1, -1], [2, 2, 2]], "motion": "run", "interpolation": "linear"}],
+        "motions": {"run": [{"time": 0}, {"time": 0.05, "translate": [0.1, 0, 0]}, {"time": 1}]},
+        "time": {"end": 0.1, "step": 0.01, "integrator": integrator},
+    }
+    with stepped(comm, content) as simulation:
+        for _ in range(4):
+            simulation.step()
+        budget = simulation.budget
+        assert budget.kinetic == pytest.approx(0.5 * 0.2 * 0.8 * 2.0**2)
+        assert budget.external_work == pytest.approx(budget.total, rel=1e-9)
+        while not simulation.finished:
+            simulation.step()
+        budget = simulation.budget
+        assert budget.kinetic < 0.01
+        assert budget.external_work == pytest.approx(budget.total, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["free", "damping"])
