@@ -78,9 +78,10 @@ class ObstacleSearch:
             others = others[is_near[others[:, 3]]]
             if not len(others):
                 return
-            swept = obstacle_x[:, others[:, :size]]
+            corners = np.ascontiguousarray(others[:, :size])
+            lower, upper = swept_boxes(obstacle_x[0], obstacle_x[-1] - obstacle_x[0], corners)
             margin = (radius + obstacles.radius[others[:, 3]])[:, None]
-            boxes = swept.min(axis=(0, 2)) - margin, swept.max(axis=(0, 2)) + margin
+            boxes = lower - margin, upper + margin
             kept = ((boxes[0] <= high) & (boxes[1] >= low)).all(axis=1)
             others, boxes = others[kept], (boxes[0][kept], boxes[1][kept])
             near_patches = overlapping_pairs(patches, boxes)
