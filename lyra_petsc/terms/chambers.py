@@ -44,6 +44,9 @@ BULK_MODULUS = 2.2e9
 FLAT = 1e-6
 """Volume over the power 3/2 of the area up to which a surface is flat."""
 
+ROUND_OFF = 32.0 * float(np.finfo(np.float64).eps)
+"""Round-off of a volume, over the power 3/2 of the area, of the sums over triangles and ranks."""
+
 COLLAPSED = 1e-12
 """Smallest volume, over that at the start, at which forces are evaluated; energies are infinite from 0 on."""
 
@@ -153,8 +156,11 @@ class Chambers(GlobalSums, MovingTargets, WritesTable):
 
     def _set_volume(self) -> None:
         """Set the volumes at the start, which ranks without elements of a chamber do not know."""
-        share = (self._share * self.elements.data["volume"])[: self.n_owned]
-        self._volume = self.over_ranks(self._by_chamber(share))
+        data, n = self.elements.data, self.n_owned
+        self._volume, area = (
+            self.over_ranks(self._by_chamber((self._share * data[name])[:n])) for name in ("volume", "area")
+        )
+        self._unresolved = ROUND_OFF * area**1.5
         with np.errstate(all="ignore"):  # of liquid
             self._relaxed = self._volume * (self._start / self._ambient) ** (1.0 / self._exponent)
         given = [filling.amount for filling in self._fillings]
@@ -235,12 +241,15 @@ class Chambers(GlobalSums, MovingTargets, WritesTable):
         weight = -(1.0 - convexity) * self.pressures(x, frozen)
         hessians(x, self.stencil[lo:hi], self._chamber[lo:hi], frozen.origin, weight, out)
 
-    def dense_hessian(self, x: Array, frozen: Filling) -> tuple[Array, Array]:
+    def _stiffness(self, x: Array, frozen: Filling) -> Array:
+        """Fall of the pressures (k,) [Pa/m³] with the volumes."""
         volume, pressure = self._state(x, frozen)
-        above = np.maximum(volume, COLLAPSED * self._volume)
         with np.errstate(all="ignore"):
-            gas = self._exponent * pressure / above
-        weights = np.where(self._is_gas, gas, BULK_MODULUS / self._largest)
+            gas = self._exponent * pressure / np.maximum(volume, COLLAPSED * self._volume)
+        return np.where(self._is_gas, gas, BULK_MODULUS / self._largest)
+
+    def dense_hessian(self, x: Array, frozen: Filling) -> tuple[Array, Array]:
+        weights = self._stiffness(x, frozen)
         vectors = np.zeros((len(weights), *x.shape))
         for unit, vector in zip(np.eye(len(weights)), vectors, strict=True):
             add_gradient(x, self.stencil, self._chamber, frozen.origin, unit, vector)
@@ -257,7 +266,10 @@ class Chambers(GlobalSums, MovingTargets, WritesTable):
     def table_rows(self, x: Array, frozen: Filling) -> list[tuple[float | str, ...]]:
         filling = self.at(x, frozen)
         assert filling.volume is not None
-        numbers = filling.volume, self.pressures(x, filling), frozen.amount
+        pressure, least = self.pressures(x, filling), self._stiffness(x, filling) * self._unresolved
+        # one that the round-off of the volume makes is none
+        pressure = np.where(np.abs(pressure) > least, pressure, 0.0)
+        numbers = filling.volume, pressure, frozen.amount
         names = [filling.label for filling in self._fillings]
         return [(name, *map(float, row)) for name, *row in zip(names, *numbers, strict=True)]
 

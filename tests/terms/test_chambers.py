@@ -196,8 +196,20 @@ def test_liquid_is_as_stiff_as_water(tmp_path: Path) -> None:
         term, x = chambers(own), own.equations.x
         frozen = frozen_by(term, own.equations)
         pressures = [term.table_rows(size * x, frozen)[0][2] for size in (1.0, 1.0 - 1e-6)]
-    assert abs(float(pressures[0])) < 1e-5
+    assert pressures[0] == 0.0
     assert pressures[1] == pytest.approx(3e-6 * BULK_MODULUS, rel=1e-4)
+
+
+@pytest.mark.parametrize("centre", [0.0, 1.0, 30.0])
+def test_pressures_of_round_off_are_none(centre: float, tmp_path: Path) -> None:
+    vertices, triangles = sphere(9, 0.3)
+    path = obj_file(tmp_path / "ball.obj", vertices + centre, triangles)
+    with built(path, {"gas": {"pressure": 0.0}}) as own:
+        term, x = chambers(own), own.equations.x
+        frozen = frozen_by(term, own.equations)
+        assert term.table_rows(x, frozen)[0][2] == 0.0
+        inflated = centre + (1.0 + 1e-12) * (x - centre)
+        assert term.table_rows(inflated, frozen)[0][2] == pytest.approx(-3 * 1.4e-12 * 101325.0, rel=0.1)
 
 
 def test_force_scale_bounds_the_round_off(tmp_path: Path) -> None:
