@@ -57,7 +57,8 @@ class Seam(Block):
     between : two str
         Groups of boundary edges, each of which is one curve: ``sheet/group`` for sheets with names. Points at
         the same part of the curves' rest lengths belong together, in the direction in which they are nearer
-        to each other at the start; panels may have different numbers of edges.
+        to each other at the start; panels may have different numbers of edges. Where three sheets meet, a
+        group is in several seams.
     reverse : bool
         Sew in the other direction.
     start : (3,) [m] or None

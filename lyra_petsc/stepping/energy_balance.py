@@ -305,13 +305,15 @@ class EnergyBalance:
         """Arrays (n_owned, 3) and numbers of a checkpoint."""
         if (last := self._last) is None:
             return {}, asdict(self.budget)
-        return {"pull": last.work, "damping": last.heat}, {**asdict(self.budget), "ahead": last.ahead}
+        heat = {"damping": last.heat} if self._equations.damping.active else {}
+        return {"pull": last.work} | heat, {**asdict(self.budget), "ahead": last.ahead}
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, Any]) -> None:
         """Restore works from a checkpoint; energies are measured at the present state."""
         works = {**numbers, "more": {}}
         if (ahead := works.pop("ahead", None)) is not None:
-            self._last = WorkingForces(arrays["pull"], arrays["damping"], ahead)
+            work = arrays["pull"]
+            self._last = WorkingForces(work, arrays.get("damping", np.zeros_like(work)), ahead)
         self.budget = Budget(**works)
         self.measure()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations, pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from mpi4py import MPI
 from oracle import frozen_by, gradient
 from physics import CLOTH, Simulation, grid, obj_file, scene_of
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh.closed_surface import holes, outward
+from lyra_petsc.mesh.closed_surface import branches, holes, outward, sewn_shut
+from lyra_petsc.mesh.seams import SeamSide, SewnCurves, Ties
 from lyra_petsc.terms.chambers import BULK_MODULUS, Chambers
 
 pytestmark = pytest.mark.quick
@@ -109,6 +112,65 @@ def test_a_surface_is_closed_over_the_gaps_of_its_seams(numbers: tuple[int, ...]
         0.5 * np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]) * x[corners][:, :, 2].mean(axis=1)
     )
     assert volume == pytest.approx(below_each[upper].sum() - below_each[~upper].sum(), rel=1e-12)
+
+
+def side(vertices: list[int]) -> SeamSide:
+    return SeamSide(np.array(vertices), np.linspace(0.0, 1.0, len(vertices)))
+
+
+def joined(one: list[int], other: list[int]) -> SewnCurves:
+    none = Ties(np.empty((0, 3), dtype=np.int64), np.empty(0), np.empty(0))
+    return SewnCurves((side(one), side(other)), 0, none)
+
+
+def assert_closed(points: Array, triangles: Ints, volume: float) -> None:
+    assert not holes(points, triangles)
+    assert not len(branches(triangles))
+    oriented, common = outward(points, triangles)
+    assert common >= 0
+    corners = points[oriented]
+    assert np.linalg.det(corners).sum() / 6.0 == pytest.approx(volume, rel=1e-12)
+
+
+def test_closed_curves_are_sewn_to_a_drum() -> None:
+    # two fans of 5 and 7 triangles above each other
+    points, triangles, rims = [], [], []
+    for n, z in ((5, 0.0), (7, 1.0)):
+        first = len(points)
+        angles = 2.0 * np.pi * np.arange(n) / n
+        points += [(0.0, 0.0, z), *((np.cos(a), np.sin(a), z) for a in angles)]
+        rims.append([first + 1 + k % n for k in range(n + 1)])
+        triangles += [(first, a, b) for a, b in pairwise(rims[-1])]
+    shut = sewn_shut(np.array(triangles), [joined(*rims)])
+    assert len(shut) == len(triangles) + 12
+    assert not holes(np.array(points), shut)
+    assert outward(np.array(points), shut)[1] >= 0
+
+
+def test_corners_between_the_gaps_of_seams_are_filled() -> None:
+    # the faces of a cube, drawn apart by 0.1: twelve seams, and eight corners of three faces
+    faces = []
+    for axis, at in product(range(3), (-1.1, 1.1)):
+        for corner in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            point = np.insert(np.array(corner, dtype=np.float64), axis, at)
+            faces.append(point)
+    points = np.array(faces)
+    triangles = np.array(
+        [(4 * k + a, 4 * k + b, 4 * k + c) for k in range(6) for a, b, c in ((0, 1, 2), (0, 2, 3))]
+    )
+    edges = [(4 * k + a, 4 * k + (a + 1) % 4) for k in range(6) for a in range(4)]
+    places = np.round(points)  # of the corners of the cube
+    seams = [
+        joined(list(one), list(other) if (places[one[0]] == places[other[0]]).all() else list(other[::-1]))
+        for one, other in combinations(edges, 2)
+        if {tuple(places[v]) for v in one} == {tuple(places[v]) for v in other}
+    ]
+    assert len(seams) == 12
+    shut = sewn_shut(triangles, seams)
+    assert len(shut) == 12 + 24 + 8
+    # the cube of 2.2 without prisms at its edges and what is left at its corners
+    corner = 0.1**3 - 0.1**3 / 6.0
+    assert_closed(points, shut, 2.2**3 - 12 * 2.0 * 0.1**2 / 2.0 - 8 * corner)
 
 
 def test_an_open_side_is_no_gap() -> None:
