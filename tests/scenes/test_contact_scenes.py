@@ -121,7 +121,7 @@ def test_a_reef_knot_holds(comm: MPI.Comm, shared_tmp: Path) -> None:
 
 
 def test_a_skirt_is_sewn_and_worn(comm: MPI.Comm, shared_tmp: Path) -> None:
-    settings = "mesh.size=0.08", "time.step=0.04", "time.end=1.12", "output.every=0.04"
+    settings = "mesh.size=0.08", "time.step=0.05", "time.end=1.1", "output.every=0.1"
     with options(direct_solver(comm)):
         run = run_of(comm, shared_tmp, "skirt", *settings)
     if run is None:
@@ -129,7 +129,7 @@ def test_a_skirt_is_sewn_and_worn(comm: MPI.Comm, shared_tmp: Path) -> None:
     waist, hem = (column(run.probes, f"{name}_z") for name in ("waist", "hem"))
     # the waist rests on the hips, which are wider below; the weight begins to act at 0.7 s
     assert waist[-1] == pytest.approx(1.0898, abs=1e-3)
-    assert hem[-1] == pytest.approx(0.6030, abs=1e-3)
+    assert hem[-1] == pytest.approx(0.6045, abs=1e-3)
     assert waist[0] > waist[-1] + 0.01
     gap = column(run.seams, "gap")
     assert gap[0] == pytest.approx(0.3)
