@@ -258,6 +258,25 @@ def test_the_energy_balance_closes(integrator: str, model: str) -> None:
     assert abs(lost[1]) < 0.75 * abs(lost[0]) or abs(lost[1]) < 0.02
 
 
+@pytest.mark.parametrize("model", ["midedge", "hinge"])
+def test_newtons_method_converges_quadratically_while_a_strip_yields(model: str) -> None:
+    content, norms = falling("beuler", model), []
+    content["material"] |= {"bending": 1e-3, "yield_curvature": 0.5}
+    content["petsc"] = {"ksp_rtol": 1e-12, "pc_type": "lu"}
+    yielding = 0
+    with stepped(MPI.COMM_SELF, content) as simulation:
+        simulation.stepper.solver.snes.setMonitor(lambda snes, number, norm: norms.append(norm))
+        for _ in range(12):
+            before = simulation.budget.dissipation
+            norms.clear()
+            simulation.step()
+            if simulation.budget.dissipation > before:
+                yielding += 1
+                assert norms[2] < 1e-2 * norms[1]
+                assert norms[3] < 1e-9 * norms[0]
+    assert yielding > 6
+
+
 def jerked(integrator: str, model: str, step: float) -> dict[str, Any]:
     """A stiff strip at rest whose clamp moves at 5 m/s at once, and which yields at once."""
     material = {"bending": 1e-2, "yield_curvature": 0.5, "bending_model": model}
