@@ -75,6 +75,9 @@ ENTRIES = {
         ("mesh.size=0.0098", "contact.gap=0.003", "output.every=0.02"),
         speed=0.6,
     ),
+    "shirt": Entry(
+        2.0, ("--colors", "#2f6f9f,#f3e7d3"), ("mesh.size=0.0104", "output.every=0.02"), speed=0.5
+    ),
     "crease": Entry(2.5, ("--field", "plastic_curvature"), speed=0.5),
 }
 
