@@ -72,7 +72,7 @@ ENTRIES = {
     "skirt": Entry(
         2.2,
         ("--colors", "#7d3c74,#f0d49a"),
-        ("mesh.size=0.0098", "contact.gap=0.003", "output.every=0.02"),
+        ("mesh.size=0.0094", "contact.gap=0.003", "output.every=0.02"),
         speed=0.6,
     ),
     "shirt": Entry(
