@@ -255,9 +255,8 @@ class UsdFrames(FrameFile):
         try:
             stage = Usd.Stage.Open(str(file), Usd.Stage.LoadNone)
         except Tf.ErrorException as error:
-            raise InputError(
-                f"cannot be read as USD ({str(error).splitlines()[0][:200]})", file=file
-            ) from None
+            why = " ".join(str(error).split())[:200]
+            raise InputError("cannot be read as USD" + (f" ({why})" if why else ""), file=file) from None
         layers = [layer.realPath for layer in stage.GetUsedLayers() if layer.realPath]
         if others := [one for one in layers if Path(one).resolve() != file.resolve()]:
             raise InputError(f"refers to another file ({others[0]}); flatten it", file=file)
@@ -267,7 +266,7 @@ class UsdFrames(FrameFile):
             if prim.IsA(UsdGeom.Mesh) and (points := UsdGeom.Mesh(prim).GetPointsAttr()).GetNumTimeSamples()
         }
         if len(moving) != 1:
-            which = f"{len(moving)} meshes with points that change ({first_few(sorted(moving))})"
+            which = f"{len(moving)} ({first_few(sorted(moving))})" if moving else "none"
             raise InputError(f"must have one mesh with points that change in time, not {which}", file=file)
         self._stage, (self._points,) = stage, moving.values()  # a stage ends with its last reference
         self._codes = self._points.GetTimeSamples()

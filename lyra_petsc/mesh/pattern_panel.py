@@ -64,6 +64,8 @@ def read_panel(
         flat[:, 0] *= -1.0
     sheet.uv = flat[sheet.triangles]
     sheet.groups += _labels(panel, sheet.groups)
+    if name == next(iter(pattern.panels)):
+        sheet.notes += pattern.notes
     return sheet
 
 

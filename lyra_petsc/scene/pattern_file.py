@@ -92,10 +92,11 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Panels by name, and stitches."""
+    """Panels by name, stitches, and lines for the user."""
 
     panels: dict[str, Panel]
     stitches: list[Stitch]
+    notes: list[str]
 
     def is_reversed(self, stitch: Stitch) -> bool:
         """Whether the sides of a stitch meet against the direction in which they are nearer to each other.
@@ -145,6 +146,8 @@ def expand_patterns(data: Mapping[str, Any], directory: Path, scene: Path | None
                 "the sheets of a pattern have the names of its panels; leave name out", file=scene, key=key
             )
         path = Path(directory, source["pattern"])
+        if path.suffix.lower() != ".json":
+            raise InputError(f"{path.name!r} must end in .json", file=scene, key=f"{key}.pattern")
         pattern = read_pattern(path)
         expanded += [{**source, "panel": name} for name in pattern.panels]
         for stitch in pattern.stitches:
@@ -203,7 +206,10 @@ def read_pattern(path: Path) -> Pattern:
         name: reader.panel(panel, name, scale, absolute=curvature == "absolute", centred=centred)
         for name, panel in panels.items()
     }
-    return Pattern(read, reader.stitches(pattern.get("stitches") or [], read))
+    notes = []
+    if not isinstance(properties, dict) or "units_in_meter" not in properties:
+        notes.append(f"{path.name} has no properties.units_in_meter: its lengths are taken as centimetres")
+    return Pattern(read, reader.stitches(pattern.get("stitches") or [], read), notes)
 
 
 class _Reader:
@@ -281,8 +287,12 @@ class _Reader:
         if ends[0] == ends[1] or np.array_equal(start, stop):
             raise self.error("begins and ends at the same place; join it to its neighbour", key)
         label = edge.get("label")
-        curve = self._curve(edge.get("curvature"), start, stop, key, scale, absolute)
-        return PanelEdge(curve, ends[0], ends[1], one_line(label) if isinstance(label, str) else "")
+        with np.errstate(over="ignore", invalid="ignore"):
+            curve = self._curve(edge.get("curvature"), start, stop, key, scale, absolute)
+            read = PanelEdge(curve, ends[0], ends[1], one_line(label) if isinstance(label, str) else "")
+            if not np.isfinite(read.length):
+                raise self.error("is too long; give its vertices and curvature smaller numbers", key)
+        return read
 
     def _curve(
         self, curvature: Any, start: Array, stop: Array, key: str, scale: float, absolute: bool

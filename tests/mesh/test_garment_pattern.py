@@ -103,6 +103,22 @@ def test_a_stitch_of_the_wrong_side_runs_the_other_way(tmp_path: Path) -> None:
     assert [pattern.is_reversed(stitch) for stitch in pattern.stitches] == [True, False]
 
 
+def test_units_that_are_missing_are_told_once(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    content = json.loads(path.read_text())
+    del content["properties"]["units_in_meter"]
+    path.write_text(json.dumps(content))
+    notes = [note for name in ("front", "back") for note in read_panel(path, name, 0.2).notes]
+    (told,) = [note for note in notes if "units_in_meter" in note]
+    assert "centimetres" in told
+    assert read_pattern(path).panels["front"].edges[2].length == pytest.approx(0.4)
+
+
+def test_what_is_no_pattern_is_not_read(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"mesh\.pattern: 'passwd' must end in \.json"):
+        expand_patterns({"mesh": {"pattern": "../passwd", "size": 0.1}}, tmp_path, None)
+
+
 WRONG: dict[str, tuple[Any, str]] = {
     "open": (
         lambda p: p["panels"]["front"]["edges"].pop(2),
@@ -124,6 +140,10 @@ WRONG: dict[str, tuple[Any, str]] = {
     "number": (
         lambda p: p["panels"]["front"]["vertices"][2].__setitem__(0, "x"),
         "panel front: vertex 2: must be a finite number, not 'x'",
+    ),
+    "huge": (
+        lambda p: p["panels"]["front"]["vertices"][2].__setitem__(0, 1e300),
+        "panel front: edge 1: is too long",
     ),
     "crossing": (
         lambda p: p["panels"]["front"].update(vertices=[[-30, 0], [30, 0], [-20, 50], [20, 50]]),
