@@ -408,16 +408,10 @@ class ContactBarrier(LimitsStep):
 
     def history(self, x: Array, frozen: ObstaclePositions) -> Mapping[str, float]:
         active, n = self.active_pairs(x, frozen.end), self.n_owned
-        scale = self.pairs.scale[:n]
-        bound = scale * active.lower_bound[:n]
-        exact = bound < scale * self.pairs.gap[:n]
-        smallest = bound[exact].min(initial=np.inf)
-        rows = np.flatnonzero(~exact & (bound < smallest))
-        if len(rows):
-            distance = np.empty(len(rows))
-            near = self.pairs.kind[rows], self.pairs.points[rows]
-            pair_distances.distances(x, frozen.end, *near, distance)
-            smallest = min(smallest, (scale[rows] * (distance - self.pairs.offset[rows])).min())
+        distance, gap = active.lower_bound[:n], self.pairs.gap[:n]  # exact below the gap
+        # which farther pairs are known depends on when they were searched
+        touches = distance < gap
+        smallest = (self.pairs.scale[:n] * distance)[touches].min(initial=np.inf)
         work = {"friction_work": 0.0}  # replaced by the friction term's if there is one
         return work | {"contacts": float(active.owned_weight.sum()), "smallest_gap": float(smallest)}
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from physics import grid, obj_file
-from test_resume import simulate_until
+from resumed_runs import simulate_until
 
 from lyra_petsc.output.read_run import StoredRun
 

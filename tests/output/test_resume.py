@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
-import json
 import shutil
-import signal
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, direct_solver, grid, options, scene_of
+from physics import CLOTH, grid
+from resumed_runs import OF_THE_SOLVER, kept, simulate_until, summary, table
 
-from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
-from lyra_petsc.arrays import Array
-from lyra_petsc.errors import InputError, Interrupted
+from lyra_petsc.errors import InputError
 from lyra_petsc.output.read_run import StoredRun, stored_states
-from lyra_petsc.output.run_folder import FolderChoice
-from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.scene.schema import INTEGRATORS
 from lyra_petsc.show.obstacle_surfaces import run_obstacles
 
@@ -96,54 +89,9 @@ def scene_with(kind: str, end: float = 0.1) -> dict[str, Any]:
     return scene | (CONTACT if contact == "contact" else {})
 
 
-def simulate_until(
-    comm: MPI.Comm, scene: dict[str, Any], folder: Path, stop: int | None, *, resume: bool = False
-) -> tuple[int, float]:
-    """Run up to step ``stop`` with a direct solver; returns step number and time."""
-    asked = itertools.count(last(folder)[0] if resume else 0)  # before the first step, and after each
-    with suppress(Interrupted), options(direct_solver(comm) | {"ksp_rtol": "1e-12"}):
-        simulate(
-            comm,
-            scene_of(scene),
-            FolderChoice(folder, resume=resume),
-            ProgressCallbacks(),
-            lambda: signal.SIGINT if next(asked) == stop else 0,
-        )
-    comm.Barrier()
-    return last(folder)
-
-
-def summary(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-
-
-def last(folder: Path) -> tuple[int, float]:
-    """Step and time of the checkpoint."""
-    with import_h5py().File(folder / "checkpoint.h5", "r") as file:
-        scalars = json.loads(file["entries"][64:].tobytes())["scalars"]
-    return scalars["step"], scalars["time"]
-
-
-def kept(folder: Path) -> dict[str, Array]:
-    """Positions, velocities and state of the integrator, in the order of the mesh."""
-    with import_h5py().File(folder / "checkpoint.h5", "r") as file:
-        return {name: np.array(data) for name, data in file["vertices"].items()}
-
-
-def table(folder: Path, name: str) -> dict[str, Array]:
-    """The columns of a table, without wall times."""
-    with open(folder / name, encoding="utf-8", newline="") as file:
-        header, *rows = csv.reader(file)
-    columns = np.array(rows, dtype=float).T
-    return {column: values for column, values in zip(header, columns, strict=True) if "wall" not in column}
-
-
 def files_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
-
-OF_THE_SOLVER = ("newton_iterations", "linear_iterations", "residual")
-"""Columns that depend on rounding if the order of a sum changes."""
 
 OF_EACH_RUN = ("versions", "wall_seconds", "resumed", "steps_of_this_run", "ranks", "partitioner")
 """Entries of summary.json about the last part of a run only."""
