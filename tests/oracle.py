@@ -13,7 +13,8 @@ from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.bending.hinge import Bending, dihedral_angles
 from lyra_petsc.terms.bending.hinge_energy import hinge_hessian
-from lyra_petsc.terms.bending.midedge import NO_REST_ROTATION, MidEdge, mean_directors
+from lyra_petsc.terms.bending.midedge import MidEdge
+from lyra_petsc.terms.bending.midedge_geometry import NO_REST_ROTATION, mean_directors
 from lyra_petsc.terms.bending.midedge_shape import (
     transported,
     unit,

@@ -381,7 +381,7 @@ def _check_sliding(rest: RestShape, held: Selection) -> None:
         free = [axis for axis in range(3) if axis not in handle.axis_numbers]
         if not handle.clamp or not free:
             continue
-        from lyra_petsc.terms.bending.midedge import normals_of  # only clamps need its kernels
+        from lyra_petsc.terms.bending.midedge_geometry import normals_of  # only clamps need its kernels
 
         at_clamp = has_edge_in(mesh, vertices)
         slope = np.abs(normals_of(mesh.positions, mesh.triangles[at_clamp])[:, free]).max(initial=0.0)

@@ -27,7 +27,7 @@ from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.scene.schema import INTEGRATORS, Scene
 from lyra_petsc.terms import registry
 from lyra_petsc.terms.bending import hinge
-from lyra_petsc.terms.bending.midedge import edge_numbers
+from lyra_petsc.terms.bending.midedge_elements import edge_numbers
 from lyra_petsc.terms.protocols import (
     Dissipates,
     HasDirectors,

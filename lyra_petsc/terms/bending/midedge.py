@@ -23,19 +23,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints, Mask, unwritable
-from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.scene.values import AXES
-from lyra_petsc.terms.bending import midedge_energy, midedge_mesh
-from lyra_petsc.terms.bending.hinge_energy import fading_limit
+from lyra_petsc.terms.bending import midedge_energy
+from lyra_petsc.terms.bending.midedge_elements import elements as elements  # the registry reads it here
+from lyra_petsc.terms.bending.midedge_geometry import (
+    areas,
+    curvatures_of_tangents,
+    director_angles,
+    mean_directors,
+    rest_rotation_of,
+    spins_of,
+)
 from lyra_petsc.terms.bending.midedge_mesh import CREASED
 from lyra_petsc.terms.bending.midedge_shape import (
     Frames,
@@ -45,7 +50,6 @@ from lyra_petsc.terms.bending.midedge_shape import (
     mark_turned_edges,
     some_perpendicular,
     tangents,
-    tangents_at,
     transport,
     transported,
     unit,
@@ -62,20 +66,9 @@ from lyra_petsc.terms.protocols import (
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Assembly, Term, UpcomingStep
 
-AnyInts = NDArray[np.int32] | NDArray[np.int64]
-
-LARGEST_FOLD = np.radians(89.95)
-"""Angle [rad] of a director at the start from which a scene is refused: the direction of the fold would
-depend on round-off."""
-
 (NO_FRICTION,) = unwritable(np.empty((0, 2)))
 NO_REST_TANGENTS = np.empty((0, 3))
 """Stands for rest tangents T̄ that are all 0."""
-NO_REST_ROTATION = np.empty((0, 3, 2))
-"""Stands for cos ᾱ and sin ᾱ of angles that are all 0."""
-
-SMALLEST_SUM = 1e-4
-"""Length of a sum of unit normals below which its direction depends on round-off."""
 
 
 class Edges(NamedTuple):
@@ -226,14 +219,14 @@ class MidEdge(HasDirectors, HasGeometry):
         y.ravel()[indices] = x.ravel()[indices]  # vertices move, unknowns of edges do not
         before, after = self._directors(x, frozen)[number], self._directors(y, frozen)[number]
         corners, moved = x[self.stencil[chosen]], increment[self.stencil[chosen]]
-        angle, normal, square, e = _director_angles(corners, before)
-        angle_after, _, square_after, _ = _director_angles(y[self.stencil[chosen]], after)
+        angle, normal, square, e = director_angles(corners, before)
+        angle_after, _, square_after, _ = director_angles(y[self.stencil[chosen]], after)
         height = np.sum(moved * normal[:, None, :], axis=2)
         size = np.sqrt(square)[:, None] * np.linalg.norm(e, axis=2)
         with np.errstate(divide="ignore", invalid="ignore"):
             # change of α to first order, from ∂α/∂x of ``midedge_energy``, and the real one
             linear = -np.einsum("eij,ekj,ek->ei", e, e, height) / size
-            spins = _spins(sign[:, :, None] * frozen.direction[number], e)
+            spins = spins_of(sign[:, :, None] * frozen.direction[number], e)
             linear += np.sum(spins * (moved[:, [2, 0, 1]] - moved[:, [1, 2, 0]]), axis=2)
             change = np.remainder(angle_after - angle + np.pi, 2.0 * np.pi) - np.pi
         weight = np.minimum(np.minimum(square, square_after) / self._constants[2][chosen], 1.0)[:, None]
@@ -365,270 +358,6 @@ class MidEdge(HasDirectors, HasGeometry):
         curvature: Array = np.einsum("eki,ei->ek", of_tangents, tangent)
         curvature[:, 2] *= 0.5
         return curvature
-
-
-def areas(material: Array) -> Array:
-    """Areas (n,) [m²] of triangles, from the vectors ``material`` (n, 2, 2) [m] along two sides."""
-    return 0.5 * np.abs(np.linalg.det(material))
-
-
-def _edge_normals(material: Array) -> tuple[Array, Array]:
-    """Outward unit normals (n, 3, 2) of the edges in material axes, and their lengths (n, 3) [m]."""
-    one, two = material[:, 0], material[:, 1]
-    side = np.stack([two - one, -two, one], axis=1)
-    size: Array = np.linalg.norm(side, axis=2)
-    return np.stack([side[..., 1], -side[..., 0]], axis=2) / size[..., None], size
-
-
-def curvatures_of_tangents(material: Array) -> Array:
-    """Curvatures κ11, κ22, 2 κ12 [1/m] (second axis) for a unit tangent T_i (third axis), (n, 3, 3)."""
-    normal, size = _edge_normals(material)
-    x, y = normal[..., 0], normal[..., 1]
-    weight = (size / areas(material)[:, None])[:, None, :]
-    return -np.stack([x * x, y * y, 2.0 * x * y], axis=1) * weight
-
-
-def normals_of(x: Array, triangles: AnyInts) -> Array:
-    """Unit normals (n, 3) of triangles (n, 3)."""
-    a, b, c = (x[triangles[:, k]] for k in range(3))
-    return unit(np.cross(b - a, c - a))
-
-
-def _director_angles(corners: Array, director: Array) -> tuple[Array, Array, Array, Array]:
-    """Angles α (n, 3) [rad] of the directors (n, 3, 3) of triangles with ``corners`` (n, 3, 3) [m].
-
-    Also the unit normals (n, 3), (2A)² (n,) [m⁴] and the edges (n, 3, 3) [m] of the triangles.
-    """
-    edges = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
-    normal = np.cross(edges[:, 1], edges[:, 2])
-    square = np.sum(normal * normal, axis=1)
-    normal = unit(normal)
-    side = np.sum(director * np.cross(unit(edges), normal[:, None, :]), axis=2)
-    return np.arctan2(side, np.sum(director * normal[:, None, :], axis=2)), normal, square, edges
-
-
-def _spins(frame: Array, edges: Array) -> Array:
-    """γ [1/m] of edges (n, 3, 3) [m] as in ``midedge_shape.spin``."""
-    square = np.sum(edges * edges, axis=2, keepdims=True)
-    along = np.sum(frame * edges, axis=2, keepdims=True)
-    return np.asarray(np.cross(edges, frame) / (square + np.sqrt(square) * along))
-
-
-def rest_rotation_of(data: Mapping[str, Array]) -> Array:
-    """cos ᾱ and sin ᾱ (E, 3, 2) of elements; empty if all sheets are flat at rest."""
-    return data["rest_rotation"] if data["rest_rotation"][..., 1].any() else NO_REST_ROTATION
-
-
-def mean_directors(
-    x: Array, triangles: AnyInts, number: AnyInts, n_edges: int, rotation: Array, limit: float = np.inf
-) -> Array:
-    """Unit mean (n_edges, 3) of the triangles' rest directors on each edge.
-
-    A rest director is the triangle's unit normal rotated about the edge by ᾱ; ``rotation`` (F, 3, 2) holds
-    cos ᾱ and sin ᾱ, or is empty. Triangles (F, 3) have the edges ``number`` (F, 3). Where rest directors
-    cancel, as in a fold of 180° or a cross, and on edges of more than ``limit`` triangles, the rest director
-    of the first triangle is taken.
-    """
-    normals = np.repeat(normals_of(x, triangles)[:, None, :], 3, axis=1)
-    if len(rotation):
-        along = unit(x[triangles[:, [2, 0, 1]]] - x[triangles[:, [1, 2, 0]]])
-        normals = rotation[..., :1] * normals + rotation[..., 1:] * np.cross(along, normals)
-    normals, edges = normals.reshape(-1, 3), number.ravel()
-    total: Array = np.stack([np.bincount(edges, normals[:, i], n_edges) for i in range(3)], axis=1)
-    present, first, count = np.unique(edges, return_index=True, return_counts=True)
-    undefined = (np.linalg.norm(total[present], axis=1) < SMALLEST_SUM) | (count > limit)
-    total[present[undefined]] = normals[first[undefined]]
-    return unit(total)
-
-
-def edge_numbers(rest: RestShape, triangles: Ints) -> tuple[Ints, NDArray[np.int8]]:
-    """Numbers (F, 3) of the edges opposite the corners of triangles (F, 3), and their signs (F, 3).
-
-    A sign is 1 where the triangle runs along the edge from the smaller vertex number, else −1.
-    """
-    tail, head = triangles[:, [1, 2, 0]], triangles[:, [2, 0, 1]]
-    n = rest.mesh.n_vertices
-    keys = rest.edges[:, 0] * n + rest.edges[:, 1]
-    number = np.searchsorted(keys, np.minimum(tail, head) * n + np.maximum(tail, head))
-    return number, np.where(tail < head, 1, -1).astype(np.int8)
-
-
-def elements(rest: RestShape) -> Elements:
-    """All triangles whose material bends by this model, with their constants (rank 0).
-
-    Raises
-    ------
-    InputError
-        If the start shape is folded by 180° at an edge and the rest shape is not, or the rest curvature is
-        too large for the mesh.
-    """
-    chosen = np.flatnonzero(rest.bends_with("midedge"))
-    mesh, triangles = rest.mesh, rest.mesh.triangles[chosen]
-    number, sign = edge_numbers(rest, triangles)
-    edges, n_edges = rest.edges, len(rest.edges)
-    material = np.linalg.inv(rest.inverse[chosen]).transpose(0, 2, 1)  # x1 − x0, x2 − x0
-    size, area = _edge_normals(material)[1], rest.area[chosen]
-    curvature = curvatures_of_tangents(material)
-    stiffness = np.array([shell.plate_matrix for shell in rest.shells])[rest.shell_of[chosen]]
-    elastic = area * rest.per_triangle("elastic_share")[chosen]
-    form = elastic[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness, curvature)
-    rest.notes += midedge_mesh.narrow_sheet_notes(rest, chosen, number, size, area)
-    rest.notes += midedge_mesh.corner_notes(rest, chosen, number, size, area)
-    # the edge of a seam may have different lengths in its two triangles
-    count = np.bincount(number.ravel(), minlength=n_edges)
-    length = np.bincount(number.ravel(), size.ravel(), n_edges) / np.maximum(count, 1)
-
-    surface = ~mesh.flat_rest[chosen]
-    angle = np.zeros_like(size)  # ᾱ
-    if surface.any():
-        # where three or more triangles meet the first one keeps its normal as director
-        on_surface = triangles[surface], number[surface]
-        director = mean_directors(mesh.rest, *on_surface, n_edges, NO_REST_ROTATION, limit=2)
-        _align_with_symmetry(director, rest, triangles, number, mesh.rest)
-        angle[surface] = _angles_at(mesh.rest, triangles[surface], director[number[surface]])
-        rest.notes += midedge_mesh.coarse_surface_notes(rest, chosen, number, size, curvature, angle)
-    if rest.scene.seams:
-        sewn = _of_edges(rest, ~np.isnan(rest.seam_angles), 0.5 * rest.seam_angles, np.nan)[number]
-        angle = np.where(np.isnan(sewn), angle, sewn)
-    rest_rotation = np.stack([np.cos(angle), np.sin(angle)], axis=2)
-    rest_tangent = np.zeros_like(size)
-    curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
-    if curved.any():
-        rest_tangent[:] = np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
-        _check_rest_curvature(rest_tangent, rest, chosen, size)
-    director = mean_directors(mesh.positions, triangles, number, n_edges, rest_rotation)
-    if rest.scene.creases or rest.scene.seams:
-        _release_creases(form, director, rest, chosen, number, rest_rotation)
-    _align_with_symmetry(director, rest, triangles, number, mesh.positions)
-    director = director[number]
-    _check_folds(_angles_at(mesh.positions, triangles, director) - angle, number, edges, rest)
-    ends: Array = mesh.positions[edges[number]]
-    data = {
-        "stiffness": np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1),
-        "rest": rest_tangent,
-        "rest_rotation": rest_rotation,
-        "sign": sign,
-        "length": length[number],
-        "direction": unit(ends[:, :, 1] - ends[:, :, 0]),
-        "director": director,
-        "material": material,
-        "triangle": chosen.astype(np.int32),
-        "height": 2.0 * area / size.max(axis=1),
-        "limit": fading_limit(area),
-        "damping": rest.per_triangle("damping")[chosen],
-    }
-    return Elements(triangles, data, edges=number)
-
-
-def _release_creases(
-    form: Array, director: Array, rest: RestShape, chosen: Ints, number: Ints, rotation: Array
-) -> None:
-    """Let triangles ``chosen`` (F,) with edges ``number`` (F, 3) end at creases as at free edges, in place.
-
-    Each of the two triangles at a crease would have a director of its own there, which its forms (F, 3, 3)
-    no longer contain (`condense_creases`). The one director (n_edges, 3) that there is turns with the first
-    triangle, whose form keeps its square alone, and is without energy in equilibrium.
-    """
-    first = _first_triangles_at_creases(rest)
-    sides = first[number] == chosen[:, None]
-    face, side = np.nonzero(sides)
-    square = form[face, side, side].copy()
-    condense_creases(form, rest, number)
-    form[face, side, side] = square
-    x, triangles = rest.mesh.positions, rest.mesh.triangles[chosen]
-    own = np.where(sides, number, len(rest.edges))
-    alone = mean_directors(x, triangles, own, len(rest.edges) + 1, rotation)
-    director[number[sides]] = alone[number[sides]]
-
-
-def _first_triangles_at_creases(rest: RestShape) -> Ints:
-    """The first triangle at each edge of the mesh, (n_edges,); −1 for edges that are no creases."""
-    return _of_edges(rest, rest.own_bending, rest.hinges.triangles[:, 0], -1)
-
-
-def _of_edges(rest: RestShape, chosen: Mask, values: NDArray[Any], missing: float) -> NDArray[Any]:
-    """The values (H,) of the chosen hinges (H,) on all edges of the mesh, (n_edges,)."""
-    keys = rest.edges[:, 0] * rest.mesh.n_vertices + rest.edges[:, 1]
-    low, high = np.sort(rest.hinges.vertices[chosen, :2], axis=1).T
-    out = np.full(len(rest.edges), missing, dtype=values.dtype)
-    out[np.searchsorted(keys, low * rest.mesh.n_vertices + high)] = values[chosen]
-    return out
-
-
-def condense_creases(form: Array, rest: RestShape, number: Ints) -> None:
-    """Replace the forms (F, 3, 3) of triangles with edges ``number`` (F, 3) by their least values over the
-    directors at creases, in place.
-    """
-    creased = _first_triangles_at_creases(rest)[number] >= 0
-    for triangle in np.flatnonzero(creased.any(axis=1)):
-        gone, kept = np.flatnonzero(creased[triangle]), np.flatnonzero(~creased[triangle])
-        whole = form[triangle].copy()
-        form[triangle] = 0.0
-        to_gone = np.linalg.solve(whole[np.ix_(gone, gone)], whole[np.ix_(gone, kept)])
-        form[triangle][np.ix_(kept, kept)] = whole[np.ix_(kept, kept)] - whole[np.ix_(kept, gone)] @ to_gone
-
-
-def _align_with_symmetry(director: Array, rest: RestShape, triangles: Ints, number: Ints, x: Array) -> None:
-    """Rotate directors (n_edges, 3) of edges in symmetry planes of handles into these planes, in place.
-
-    A symmetry plane is given in the start shape. At other positions x (the rest shape) it is taken to have
-    the same orientation relative to each triangle.
-    """
-    mesh = rest.mesh
-    for index, handle in enumerate(rest.scene.handles):
-        if handle.symmetry is None:
-            continue
-        held = select_vertices(mesh, handle, key=f"handles[{index}]", file=rest.scene.source)
-        ends = triangles[:, [[1, 2], [2, 0], [0, 1]]]
-        face, side = np.nonzero(np.isin(ends, held).all(axis=2))
-        edges, corners = number[face, side], ends[face, side]
-
-        def axes(at: Array, face: Ints = face, corners: Ints = corners) -> Array:
-            """Edge, direction in the triangle normal to it, and normal, (n, 3, 3)."""
-            normal, along = normals_of(at, triangles[face]), unit(at[corners[:, 1]] - at[corners[:, 0]])
-            return np.stack([along, np.cross(normal, along), normal], axis=1)
-
-        start, here = axes(mesh.positions), axes(x)
-        plane = np.einsum("eik,ei->ek", here, start[:, :, AXES.index(handle.symmetry)])
-        inside = unit(np.cross(plane, here[:, 0]))
-        towards = np.sum(inside * director[edges], axis=1, keepdims=True)
-        director[edges] = np.where(towards < 0.0, -inside, inside)
-
-
-def _angles_at(x: Array, triangles: Ints, director: Array) -> Array:
-    """Angles α (n, 3) [rad] of directors (n, 3, 3) of the edges of triangles (n, 3) at positions x."""
-    return _director_angles(x[triangles], director)[0]
-
-
-def _check_folds(angle: Array, number: Ints, edges: Ints, rest: RestShape) -> None:
-    """Refuse a start shape that is folded by nearly 180° relative to the rest shape at an edge."""
-    fold = np.abs(np.remainder(angle.ravel() + np.pi, 2.0 * np.pi) - np.pi)
-    folded = np.flatnonzero(~(fold < LARGEST_FOLD))
-    if len(folded):
-        a, b = edges[number.ravel()[folded[0]]]
-        raise InputError(
-            f"the start shape is folded by 179.9° or more at the edge of vertices {a} and {b}, the rest "
-            "shape is not, and bending_model: midedge cannot tell to which side; open the fold (or, where "
-            "sheets meet, turn one over), or take bending_model: hinge",
-            file=rest.scene.source,
-            key="mesh",
-        )
-
-
-def _check_rest_curvature(rest_tangent: Array, rest: RestShape, chosen: Ints, size: Array) -> None:
-    """Refuse triangles ``chosen`` with edges ``size`` (n, 3) [m] if their tangents T̄ ``rest_tangent`` (n, 3)
-    belong to angles beyond 180°.
-    """
-    largest, limit = np.abs(rest_tangent).max(axis=1), float(tangents_at(np.array(np.pi)))
-    worst = int(largest.argmax())
-    if largest[worst] > limit:
-        raise InputError(
-            f"turns triangle {chosen[worst]} by more than 180° against its edges, of up to "
-            f"{size[worst].max():.3g} m, which no edge can; take a mesh finer by "
-            f"{largest[worst] / limit:.2g}, or less curvature",
-            file=rest.scene.source,
-            key=f"material[{rest.shell_of[chosen[worst]]}].rest_curvature",
-        )
 
 
 def coarse_elements(rest: RestShape) -> Elements:

@@ -18,7 +18,9 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
-from lyra_petsc.terms.bending.midedge import MidEdge, edge_numbers, normals_of
+from lyra_petsc.terms.bending.midedge import MidEdge
+from lyra_petsc.terms.bending.midedge_elements import edge_numbers
+from lyra_petsc.terms.bending.midedge_geometry import normals_of
 from lyra_petsc.terms.bending.midedge_shape import Frames, transported, unit
 from lyra_petsc.terms.handles.motion import Motion, Window
 from lyra_petsc.terms.rest import RestShape

@@ -23,9 +23,10 @@ import numpy as np
 from lyra_petsc.arrays import Array, unwritable
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.bending import hinge, midedge, midedge_energy
+from lyra_petsc.terms.bending import hinge, midedge_elements, midedge_energy
 from lyra_petsc.terms.bending.hinge import edge_in_material
 from lyra_petsc.terms.bending.midedge import NO_FRICTION, MidEdge
+from lyra_petsc.terms.bending.midedge_geometry import areas, curvatures_of_tangents
 from lyra_petsc.terms.bending.midedge_shape import Frames
 from lyra_petsc.terms.protocols import AT_LIMIT, Located, Place, SharesFrozen, TermState, Yields
 from lyra_petsc.terms.rest import RestShape
@@ -187,17 +188,17 @@ def sliding_elements(rest: RestShape, stiffness: Array, limit: Array, *also: str
         Names of constants of `MidEdge` that the elements keep, too.
     """
     notes = list(rest.notes)
-    triangles = midedge.elements(rest)
+    triangles = midedge_elements.elements(rest)
     rest.notes = notes  # those of the sheet only
     data = dict(triangles.data)
     shell = rest.shell_of[data["triangle"].astype(np.int64)]
-    curvature, area = midedge.curvatures_of_tangents(data["material"]), midedge.areas(data["material"])
+    curvature, area = curvatures_of_tangents(data["material"]), areas(data["material"])
     form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness[shell], curvature)
     rows = stiffness[shell, 0, 0] > 0.0
     assert triangles.edges is not None
     if rest.scene.creases or rest.scene.seams:
         part = form[rows]
-        midedge.condense_creases(part, rest, triangles.edges[rows])
+        midedge_elements.condense_creases(part, rest, triangles.edges[rows])
         form[rows] = part
     data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
     data["r_y"] = np.sqrt(area * limit[shell])

@@ -61,7 +61,8 @@ def coarse_surface_notes(
     """Notes on curved rest shapes that the mesh does not resolve.
 
     ``chosen`` are the triangles (n,), ``number`` (n, 3) their edges, ``size`` (n, 3) the edges' lengths [m],
-    ``of_tangents`` (n, 3, 3) as by `midedge.curvatures_of_tangents`, and ``angle`` (n, 3) the angles ᾱ [rad].
+    ``of_tangents`` (n, 3, 3) as by `midedge_geometry.curvatures_of_tangents`, and ``angle`` (n, 3) the
+    angles ᾱ [rad].
 
     Flat triangles resolve a shell of thickness t and radius R with edges below √(t R); t = √(12 B / C) for
     bending stiffness B and membrane stiffness C. Folds between plane walls are not counted as curvature: on a

@@ -27,8 +27,8 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending.hinge import whole_hinges
 from lyra_petsc.terms.bending.hinge_plasticity import yielding
-from lyra_petsc.terms.bending.midedge import areas, curvatures_of_tangents
 from lyra_petsc.terms.bending.midedge_friction import MidEdgeFriction, sliding_elements
+from lyra_petsc.terms.bending.midedge_geometry import areas, curvatures_of_tangents
 from lyra_petsc.terms.rest import RestShape
 
 
