@@ -171,8 +171,8 @@ def note_changes(simulation: SteppedScene, before: Path) -> tuple[list[Change], 
     if any(change.key.startswith(("obstacles", "motions")) for change in changes):
         with suppress(InputError):  # what is no scene is compared as text only
             earlier = on_root(comm, lambda: obstacle_motions(load_scene(before, meshes_needed=False)))
-            now = obstacle_motions(scene)
-            earlier_motions = {n: motion for n, motion in earlier.items() if n in now and motion != now[n]}
+            names, now = scene.obstacles or {}, obstacle_motions(scene)
+            earlier_motions = {n: one for n, one in earlier.items() if n in names and one != now.get(n)}
     frames = on_root(comm, lambda: frame_changes(before.parent, simulation.problem.mesh))
     notes += [f"changed since the run was begun: {text}" for text in frames]
     for change in changes:

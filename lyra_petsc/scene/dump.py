@@ -112,13 +112,16 @@ def scene_changes(before: Path, scene: Scene) -> list[Change]:
 
 
 def obstacle_motions(scene: Scene) -> dict[str, Any]:
-    """``motion``, a list of keyframes as plain values, and ``interpolation`` of each obstacle, by name."""
+    """``motion``, a list of keyframes as plain values, and ``interpolation`` of each obstacle without frames,
+    by name.
+    """
     return {
         name: {
             "motion": [_plain_value(keyframe) for keyframe in scene.keyframes(obstacle)],
             "interpolation": obstacle.interpolation,
         }
         for name, obstacle in (scene.obstacles or {}).items()
+        if obstacle.mesh is None or obstacle.mesh.frames is None
     }
 
 

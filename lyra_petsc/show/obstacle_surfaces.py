@@ -70,7 +70,10 @@ def _with_earlier_motion(
     def moved(time: float) -> tuple[Array, Array]:
         return (before if time <= until else obstacle).rigid_motion(time)
 
-    return replace(obstacle, motion=moved)
+    if isinstance(obstacle, Container) or obstacle.deformation is None:
+        return replace(obstacle, motion=moved)
+    rigid = replace(before, deformation=None)
+    return replace(obstacle, deformation=lambda time: (rigid if time <= until else obstacle).positions(time))
 
 
 CIRCLE_POINTS = 48

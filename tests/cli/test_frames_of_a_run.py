@@ -11,6 +11,7 @@ from launch import DIRECT, done, lyra, refusal, refused, write_scene
 
 import lyra_petsc
 from lyra_petsc.mesh.obstacles import BOX_TRIANGLES
+from lyra_petsc.show.obstacle_surfaces import run_obstacles
 
 SCENE = """
 mesh:
@@ -125,3 +126,18 @@ def test_the_cloth_of_a_run_is_the_body_of_another(tmp_path: Path) -> None:
     moved = [run.positions[-1][::7] - run.positions[0][::7] for run in (first, second)]
     assert np.abs(moved[0]).max() > 2e-3
     np.testing.assert_allclose(moved[1], moved[0], atol=1e-9)
+
+
+def test_a_body_that_gets_frames_is_shown_where_it_was(tmp_path: Path) -> None:
+    write_frames(tmp_path)
+    down = CORNERS - 0.1 * TIMES[:, None, None]
+    np.savez(tmp_path / "walk.npz", time=TIMES, position=down)
+    aside = "motion: [{time: 0}, {time: 0.1, translate: [0.01, 0, 0]}]"
+    keyed = SCENE.replace("tray.obj, frames: walk.npz, repeat: true}", f"tray.obj}}, {aside}")
+    end = "time: {end: 0.05, step: 0.01}\n"
+    done(["run", write_scene(tmp_path, keyed + end), "--out", "run", "-ts_max_steps", "2"], tmp_path)
+    done(["run", write_scene(tmp_path, SCENE + end), "--out", "run", "--resume"], tmp_path)
+    run = lyra_petsc.Run(tmp_path / "run")
+    (tray,) = run_obstacles(run)
+    np.testing.assert_allclose(tray.positions(0.01), CORNERS + [1e-3, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(tray.positions(0.05), down[2], atol=1e-12)
