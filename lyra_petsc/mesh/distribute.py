@@ -15,8 +15,9 @@ from mpi4py.util import pkl5
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.mesh.partitioner import locality_order, partition, vertex_graph
+from lyra_petsc.mesh.partitioner import Graph, locality_order, partition, vertex_graph
 from lyra_petsc.mesh.points import Layout, Numbering, Unknowns
+from lyra_petsc.mesh.topology import connected_components
 
 TIED = "tied vertices"
 """Name of the elements (n, 2) of vertices that are held together without being one, as by seams."""
@@ -170,17 +171,32 @@ def split_elements(owner: Ints, n_ranks: int) -> list[tuple[Ints, int]]:
     return pieces
 
 
+def _partition(
+    comm: MPI.Comm, whole: GlobalMesh | None, graph: Graph | None, n_vertices: int
+) -> tuple[Ints | None, str]:
+    """As `partition`, but with each tied vertex on the rank of the first one that it is tied to."""
+    if whole is None or TIED not in whole.elements:
+        return partition(comm, graph, n_vertices, whole.positions if whole else None)
+    ties = whole.elements[TIED].stencil.astype(np.int64)
+    first = ties[np.unique(ties[:, 0], return_index=True)[1]]
+    chosen, group = np.unique(connected_components(n_vertices, first), return_inverse=True)
+    corners = group[whole.triangles]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+    positions = None if whole.positions is None else whole.positions[chosen]
+    owner, name = partition(comm, vertex_graph([corners], len(chosen)), len(chosen), positions)
+    return None if owner is None else owner[group], name
+
+
 def distribute(comm: MPI.Comm, whole: GlobalMesh | None) -> LocalMesh:
     """Partition the mesh and send each rank its part; collective. ``whole`` is needed on rank 0 only."""
     n_vertices = comm.bcast(whole.n_vertices if whole else 0, root=0)
     graph = None
     if whole:
-        ties = [part.stencil.astype(np.int64) for name, part in whole.elements.items() if name == TIED]
-        graph = vertex_graph([whole.triangles, *ties], n_vertices)
+        graph = vertex_graph([whole.triangles], n_vertices)
     if comm.bcast(whole is not None and whole.owner is not None):
         owner, name = (whole.owner if whole else None), "given"
     else:
-        owner, name = partition(comm, graph, n_vertices, whole.positions if whole else None)
+        owner, name = _partition(comm, whole, graph, n_vertices)
     messages = pkl5.Intracomm(comm)  # sends arrays without a copy, also those of more than 2 GiB
     if comm.rank == 0:
         assert whole is not None

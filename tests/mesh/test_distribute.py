@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from lyra_petsc.arrays import Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import grid_sheet
-from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute
+from lyra_petsc.mesh.distribute import TIED, GlobalMesh, LocalMesh, distribute
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.partitioner import partition, vertex_graph
 from lyra_petsc.mesh.topology import hinges
@@ -216,3 +216,22 @@ def test_further_ghosts_come_after_the_present_ones(comm: MPI.Comm, part: LocalM
     np.testing.assert_array_equal(values[:, 0], more.global_number)
     assert (more.n_vertices, more.n_edges) == (layout.n_vertices, layout.n_edges)
     more.destroy()
+
+
+@pytest.mark.parametrize("near", [False, True], ids=["graph", "space"])
+def test_tied_vertices_are_on_one_rank(near: bool, comm: MPI.Comm) -> None:
+    """Otherwise the cheapest cut of two sheets would be their seam; the last vertex is tied to two."""
+    triangles, n = square(20, 20)
+    sheet = grid_sheet(Grid(width=1, height=1, nx=20, ny=20, pattern="alternating")).points
+    right, left = (np.flatnonzero(sheet[:, 0] == x) for x in (1.0, 0.0))
+    pairs = np.column_stack([n + left, right])
+    ties = np.concatenate([pairs, [[n + left[-1], right[-2]]]])
+    whole = whole_of(np.concatenate([triangles, n + triangles]), 2 * n)
+    whole.elements |= {TIED: Elements(ties), "pairs": Elements(pairs)}
+    whole.positions = np.concatenate([sheet, sheet + [1.5, 0.0, 0.0]]) if near else None
+    part = distribute(comm, whole if comm.rank == 0 else None)
+    own = part.elements["pairs"].stencil < part.layout.n_owned
+    assert (own[:, 0] == own[:, 1]).all()
+    assert comm.allreduce(int(own[:, 0].sum())) == 21
+    sizes = comm.allgather(part.layout.n_owned)
+    assert max(sizes) <= 1.1 * min(sizes)
