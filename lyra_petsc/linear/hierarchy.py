@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints, Mask
-from lyra_petsc.linear.coarsening import coarsen
+from lyra_petsc.linear.coarsening import CoarseMesh, coarsen
 from lyra_petsc.linear.galerkin import Galerkin
 from lyra_petsc.linear.pattern import BlockPattern, row_pointers
 from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.mesh.points import Layout, Points
 
 if TYPE_CHECKING:
+    from lyra_petsc.linear.tied_vertices import Combination, CompressedRows, TiedVertices
     from lyra_petsc.terms.bending.director_rotations import DirectorRotations
 
 
@@ -37,10 +38,14 @@ class Surface:
         Positions [m] of the owned vertices, from which interpolation weights are computed.
     triangles : (F, 3)
         Local numbering.
+    ties : sequence of ((n, m), (n, m))
+        Vertices in local numbering, and factors with which the sum of their positions stays near zero; each
+        tie is on one rank.
     """
 
     x: Array
     triangles: NDArray[np.int32]
+    ties: Sequence[tuple[Ints, Array]] = ()
 
 
 @dataclass(frozen=True)
@@ -228,13 +233,22 @@ def interpolations(layout: Layout, surface: Surface, max_levels: int) -> list[In
     comm, n = layout.comm, layout.n_vertices
     first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
     corners = layout.vertex_numbers(layout.global_number[surface.triangles[first_owned]])
-    parts = comm.gather((surface.x, corners, layout.mesh_vertices))
+    ties = [(layout.vertex_numbers(layout.global_number[rows]), factors) for rows, factors in surface.ties]
+    parts = comm.gather((surface.x, corners, layout.mesh_vertices, ties))
     shares: list[list[InterpolationRows]] = []
     if parts is not None:
-        x, triangles, original = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
-        del parts
+        *arrays, tied = zip(*parts, strict=True)
+        x, triangles, original = map(np.concatenate, arrays)
+        del parts, arrays
         serial = np.arange(len(x)) if comm.size == 1 else _serial_numbers(triangles, original)
-        shares = _shares(x, triangles, serial, layout.vertex_bounds, max_levels)
+        every = sorted(
+            list(zip(serial[vertices].tolist(), factors.tolist(), strict=True))
+            for of_rank in tied
+            for of_term in of_rank
+            for vertices, factors in zip(*of_term, strict=True)
+        )
+        combinations = [{vertex: factor for vertex, factor in tie if factor != 0.0} for tie in every]
+        shares = _shares(x, triangles, serial, layout.vertex_bounds, max_levels, combinations)
     share: list[InterpolationRows] = comm.scatter(shares)
     if share and layout.n_owned > n:
         start = share[0].start
@@ -249,31 +263,46 @@ def _serial_numbers(triangles: Ints, original: Ints) -> Ints:
 
 
 def _shares(
-    x: Array, triangles: Ints, serial: Ints, bounds: Ints, max_levels: int
+    x: Array, triangles: Ints, serial: Ints, bounds: Ints, max_levels: int, ties: list[Combination]
 ) -> list[list[InterpolationRows]]:
     """Rows of each rank, from all vertices x (N, 3) and triangles (F, 3) in global numbers.
 
-    ``serial`` (N,) are the vertices' numbers in a run on one rank, in which coarse meshes are built.
+    ``serial`` (N,) are the vertices' numbers in a run on one rank, in which coarse meshes are built; ``ties``
+    are in these numbers.
     """
     shares: list[list[InterpolationRows]] = [[] for _ in bounds[1:]]
     number = np.argsort(serial)
     x, triangles = x[number], serial[triangles]
     triangles = triangles[np.lexsort(np.sort(triangles, axis=1).T[::-1])]
+    unknown = serial  # the vertex of the mesh that is each unknown
+    tied: TiedVertices | None = None
+    rows: CoarseMesh | CompressedRows
     levels = 1
-    while levels < max_levels and (len(x) > COARSEST or levels == 1):
-        coarse = coarsen(x, triangles)
-        if len(coarse.vertices) > MAX_RATIO * len(x):
-            break
-        kept = number[coarse.vertices]
+    while levels < max_levels and (len(unknown) > COARSEST or levels == 1):
+        if ties and tied is None:
+            from lyra_petsc.linear.tied_vertices import TiedVertices  # only needed here
+
+            vertices, tied = np.arange(len(x)), TiedVertices(len(x), ties)
+            free, rows, nearest = tied.free, tied.rows, tied.nearest
+        else:
+            rows = coarse = coarsen(x, triangles)
+            vertices = coarse.vertices
+            x, triangles = x[vertices], coarse.triangles
+            free = nearest = np.arange(len(vertices))
+            if tied is not None:
+                tied = tied.coarse(coarse)
+                free, rows, nearest = tied.free, tied.after(coarse), tied.nearest
+            if len(free) > MAX_RATIO * len(unknown):
+                break
+        kept = number[vertices[free]]
         coarse_bounds = np.searchsorted(np.sort(kept), bounds)
-        coarse_number = np.argsort(np.argsort(kept))
-        serial = np.argsort(number)
+        coarse_number = np.argsort(np.argsort(kept, kind="stable"))
         for share, lo, hi in zip(shares, bounds, bounds[1:], strict=False):
-            first, counts = coarse.start[serial[lo:hi]], np.diff(coarse.start)[serial[lo:hi]]
+            first, counts = rows.start[unknown[lo:hi]], np.diff(rows.start)[unknown[lo:hi]]
             start = row_pointers(counts)
-            rows = np.arange(start[-1]) + np.repeat(first - start[:-1], counts)
-            parents = coarse_number[coarse.parents[rows]]
-            share.append(InterpolationRows(coarse_bounds, start, parents, coarse.weights[rows]))
-        x, triangles, number, bounds = x[coarse.vertices], coarse.triangles, coarse_number, coarse_bounds
+            at = np.arange(start[-1]) + np.repeat(first - start[:-1], counts)
+            parents = coarse_number[rows.parents[at]]
+            share.append(InterpolationRows(coarse_bounds, start, parents, rows.weights[at]))
+        number, unknown, bounds = coarse_number[nearest], free[np.argsort(coarse_number)], coarse_bounds
         levels += 1
     return shares

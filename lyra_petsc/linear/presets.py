@@ -127,11 +127,13 @@ def candidates(
     newton: bool = True,
     iterations: float = 0.0,
     contact: bool = False,
+    tied: bool = False,
 ) -> list[str]:
     """Presets to try in this order; only ``user`` if the user chose the preconditioner.
 
     ``newton``: a step takes more than one linear solve. ``iterations``: expected number of conjugate gradient
-    iterations with block Jacobi without ``contact``.
+    iterations with block Jacobi without ``contact``. ``tied``: vertices are held together, which of all but
+    factorisations only multigrid knows.
     """
     if is_set("pc_type"):
         return ["user"]
@@ -145,7 +147,7 @@ def candidates(
     # PETSc's parallel matrix types have no incomplete factors of their own, only block by block
     several = ranks > 1 or PETSc.Options().getString("mat_type", "").startswith("mpi")
     incomplete = "block-ilu" if several else "ilu"
-    small = n_vertices < MULTIGRID_FROM[newton]
+    small = n_vertices < MULTIGRID_FROM[newton] and not tied
     if iterations > _factor_cost(n_vertices) * (COST_INCOMPLETE if small else COST):
         return [*factors, *last]
     if not small:

@@ -44,7 +44,7 @@ from lyra_petsc.terms.handles.prescribed_handles import (
     select_exact,
 )
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.protocols import HasDirectors, SumsOverRanks
+from lyra_petsc.terms.protocols import HasDirectors, HoldsTogether, SumsOverRanks
 from lyra_petsc.terms.registry import Role, make_term, needed_terms, registration_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Load, Term
@@ -509,7 +509,9 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     equations.x[rows] = data["position"]
     layout.update_ghosts(equations.x)
     surface = Surface(
-        equations.x[rows].copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil
+        equations.x[rows].copy(),
+        next(t for t in terms.values() if isinstance(t, Membrane)).stencil,
+        [term.ties() for term in terms.values() if isinstance(term, HoldsTogether)],
     )
     # reference positions of handles are those before noise
     equations.reference.record_starts(0.0, equations.x)

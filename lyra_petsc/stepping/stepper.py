@@ -28,6 +28,7 @@ from lyra_petsc.stepping.newton.newton_trace import FailedSolve
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.stage_solver import StageSolver
 from lyra_petsc.stepping.time_step import Evaluation
+from lyra_petsc.terms.protocols import HoldsTogether
 
 if TYPE_CHECKING:
     from lyra_petsc.contact.collisions import RefusedDisplacement
@@ -138,6 +139,7 @@ class Stepper:
             newton=equations.integrator.iterates,
             iterations=0.0 if static else expected_iterations(equations.forces, step),
             contact=equations.contact is not None,
+            tied=any(isinstance(term, HoldsTogether) for term in equations.active.elastic),
         )
 
     def _take_integrator(self, candidates: list[str]) -> None:

@@ -191,8 +191,14 @@ class HoldsTogether(Elastic):
     """An energy so stiff that it holds parts together, once they are.
 
     While they are apart, an integrator that does not damp stiff motions would let them swing against each
-    other for ever: that for contact takes the steps.
+    other for ever: that for contact takes the steps. Multigrid moves them together.
     """
+
+    @abstractmethod
+    def ties(self) -> tuple[Ints, Array]:
+        """Local numbers (n, m) of the vertices in the owned springs that are not soft against the sheet, and
+        factors (n, m) with which the sum of their positions is zero if the parts are together.
+        """
 
     @abstractmethod
     def are_apart(self, x: Array, frozen: Any) -> bool:

@@ -27,6 +27,10 @@ RIGID = 1000.0
 """Stiffness of rigid seams times the edge length, over the membrane stiffness: the gap over the edge length
 is the strain across the seam, in the sheet beside it, over this number."""
 
+SOFT = 0.05
+"""Stiffness of seams in the same measure up to which multigrid takes fewer iterations if it does not know
+them."""
+
 
 class ThreadLengths(NamedTuple):
     """Lengths of the threads in one step.
@@ -58,7 +62,8 @@ class SeamThreads(MovingTargets, HoldsTogether, WritesTable):
     ----------
     elements : Elements
         Stencil (E, 3) as of `Ties`; data ``weight`` (E,), ``k`` (E,) [N/m], ``gap`` (E,) distance at the
-        start [m], ``seam`` (E,) number of the seam, ``sign`` (E,) −1 where its first side is the tied one.
+        start [m], ``seam`` (E,) number of the seam, ``sign`` (E,) −1 where its first side is the tied one,
+        ``soft`` (E,) 1 where the seam is soft against the sheet, else 0.
     seams : list of Seam
         Of the scene.
     """
@@ -129,6 +134,10 @@ class SeamThreads(MovingTargets, HoldsTogether, WritesTable):
         apart = np.linalg.norm(self._gaps(x), axis=1) > AT_VERTEX * edge
         return bool((apart & self._rigid)[: self.n_owned].any())
 
+    def ties(self) -> tuple[Ints, Array]:
+        stiff = np.flatnonzero(self.elements.data["soft"][: self.n_owned] == 0.0)
+        return self.stencil[stiff].astype(np.int64), self._factors[stiff]
+
     def force_scale(self, size: float) -> Array:
         return self._k * size
 
@@ -160,14 +169,14 @@ class SeamThreads(MovingTargets, HoldsTogether, WritesTable):
         return rows
 
 
-def stiffness_of(rest: RestShape, seam: Seam, ties: Ties) -> float:
-    """Stiffness [N/m²] of a seam."""
-    if not isinstance(seam.stiffness, str):
-        return seam.stiffness
+def stiffness_of(rest: RestShape, seam: Seam, ties: Ties) -> tuple[float, bool]:
+    """Stiffness [N/m²] of a seam, and whether it is soft against the sheet."""
     beside = np.isin(rest.mesh.triangles, ties.stencil).sum(axis=1) > 1
     shells = [rest.shells[number] for number in np.unique(rest.shell_of[beside])]
     edge = float(np.sqrt(4.0 / np.sqrt(3.0) * rest.area[beside].mean()))
-    return RIGID * max(max(shell.c11, shell.c22) for shell in shells) / edge
+    of_sheet = max(max(shell.c11, shell.c22) for shell in shells) / edge
+    k = RIGID * of_sheet if isinstance(seam.stiffness, str) else seam.stiffness
+    return k, k <= SOFT * of_sheet
 
 
 def _springs_shut(seam: Seam, gap: Array) -> bool:
@@ -178,7 +187,7 @@ def _springs_shut(seam: Seam, gap: Array) -> bool:
 def elements(rest: RestShape) -> Elements:
     """The ties of all seams (rank 0)."""
     stencils: list[Ints] = []
-    data: dict[str, list[Array]] = {name: [] for name in ("weight", "k", "gap", "seam", "sign")}
+    data: dict[str, list[Array]] = {name: [] for name in ("weight", "k", "soft", "gap", "seam", "sign")}
     for number, sewn in enumerate(sewn_curves(rest.scene, rest.mesh)):
         ties = sewn.ties
         if not len(ties.stencil):
@@ -193,7 +202,9 @@ def elements(rest: RestShape) -> Elements:
         )
         stencils.append(ties.stencil)
         data["weight"].append(ties.weight)
-        data["k"].append(stiffness_of(rest, seam, ties) * ties.share)
+        k, soft = stiffness_of(rest, seam, ties)
+        data["k"].append(k * ties.share)
+        data["soft"].append(np.full(n, float(soft)))
         data["gap"].append(gap)
         data["seam"].append(np.full(n, float(number)))
         data["sign"].append(np.full(n, -1.0 if sewn.tied == 0 else 1.0))

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.forces import StageForces
 from lyra_petsc.stepping.time_step import Evaluation
-from lyra_petsc.terms.protocols import LimitsStep
+from lyra_petsc.terms.protocols import HoldsTogether, LimitsStep
+from lyra_petsc.terms.term import Elastic
 
 ROUNDOFF = 10.0 * float(np.finfo(np.float64).eps)
 """Relative round-off of an internal force that is computed from differences of coordinates, and of a sum."""
 
 
-def vertex_scales(forces: StageForces, size: float) -> Array:
-    """Force [N] at each owned row (n_owned,) if all coordinates changed by ``size`` [m] at random."""
-    points = forces.layout
+def vertex_scales(points: Layout, terms: Iterable[Elastic], size: float) -> Array:
+    """Force [N] of terms at each owned row (n_owned,) if coordinates changed by ``size`` [m] at random."""
     scale = np.zeros(points.n_local)
-    for term in forces.active.elastic:
+    for term in terms:
         amount = np.repeat(term.force_scale(size), term.stencil.shape[1])
         scale += np.bincount(term.stencil.ravel(), amount, points.n_local)
         if term.edges is not None:
@@ -31,10 +33,12 @@ def expected_iterations(forces: StageForces, dt: float) -> float:
     """Iterations of conjugate gradients with block Jacobi in a step of length dt [s]; collective.
 
     It is half the root of the largest ratio of stiffness to inertia: after scaling with the diagonal the
-    spectrum reaches from the inertia to the stiffness.
+    spectrum reaches from the inertia to the stiffness. What holds parts together does not count: it is no
+    reason against multigrid, which knows it.
     """
     n = forces.layout.n_vertices
-    ratio = dt * dt * vertex_scales(forces, 1.0)[:n] / forces.mass[:n]
+    terms = [term for term in forces.active.elastic if not isinstance(term, HoldsTogether)]
+    ratio = dt * dt * vertex_scales(forces.layout, terms, 1.0)[:n] / forces.mass[:n]
     return 0.5 * float(np.sqrt(forces.layout.global_max(float(ratio.max(initial=0.0)))[0]))
 
 
@@ -43,7 +47,7 @@ def residual_roundoff(forces: StageForces, size: float) -> float:
 
     ``size`` [m] is the largest coordinate; strains are differences of such numbers.
     """
-    return _norm(forces.layout, vertex_scales(forces, size))
+    return _norm(forces.layout, vertex_scales(forces.layout, forces.active.elastic, size))
 
 
 def limit_roundoff(at: Evaluation) -> float:
