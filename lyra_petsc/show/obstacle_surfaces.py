@@ -72,7 +72,7 @@ def _with_earlier_motion(
 
     if isinstance(obstacle, Container) or obstacle.deformation is None:
         return replace(obstacle, motion=moved)
-    rigid = replace(before, deformation=None)
+    rigid = replace(obstacle, motion=motion, deformation=None)
     return replace(obstacle, deformation=lambda time: (rigid if time <= until else obstacle).positions(time))
 
 
