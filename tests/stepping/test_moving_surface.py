@@ -11,6 +11,7 @@ from mpi4py import MPI
 from physics import grid
 
 from lyra_petsc.api.simulations import Simulation
+from lyra_petsc.errors import SolverError
 from lyra_petsc.mesh.obstacles import BOX_TRIANGLES, surface_motion
 from lyra_petsc.scene.schema import Obstacle
 
@@ -215,3 +216,54 @@ def test_frames_run_over_the_load_factor_of_a_static_analysis(
     reached, expected = final(comm, by_frames), final(comm, by_keyframes)
     assert expected[:, 2].max() > 0.025
     assert np.abs(reached - expected).max() < 1e-6
+
+
+def closing_boxes(folder: Path, high: float) -> dict[str, Any]:
+    """One body of two boxes below a height [m], which pass into each other up to 0.1 s and leave again; and a
+    sheet that hangs between them from its upper side, 0.1 m high.
+    """
+    box = np.array([[x, y, z] for z in (-0.1, high) for y in (-0.1, 0.1) for x in (0.0, 0.1)])
+    x = np.concatenate([box - [0.12, 0.0, 0.0], box + [0.02, 0.0, 0.0]])
+    side = np.repeat([1.0, -1.0], 8)[:, None] * [1.0, 0.0, 0.0]
+    triangles = np.concatenate([BOX_TRIANGLES, BOX_TRIANGLES + 8])
+    rows = [f"v {a} {b} {c}" for a, b, c in x] + [f"f {a} {b} {c}" for a, b, c in triangles + 1]
+    (folder / "body.obj").write_text("\n".join(rows) + "\n")
+    shifts = np.array([0.0, 0.04, 0.0])[:, None, None]
+    np.savez(folder / "close.npz", time=[0.0, 0.1, 0.2], position=x + shifts * side)
+    turn = {"rotate": {"axis": [1, 1, 1], "degrees": 120}, "translate": [0.0, -0.05, 0.0]}
+    mesh = {"file": str(folder / "body.obj"), "frames": str(folder / "close.npz")}
+    return {
+        "mesh": grid(0.1, 0.1, 4, 4) | {"transform": turn},
+        "material": {"cloth": "gray-interlock", "damping": 0.02},
+        "handles": [{"box": [[-1, -1, 0.099], [1, 1, 1]]}],
+        "contact": {"gap": 0.004},
+        "obstacles": {"body": {"mesh": mesh, "interpolation": "linear"}},
+        "time": {"end": 0.2, "step": 0.01},
+    }
+
+
+def test_parts_of_a_body_that_cross_beside_a_sheet_do_not_matter(comm: MPI.Comm, shared_tmp: Path) -> None:
+    x = final(comm, shared(comm, shared_tmp, -0.02))
+    np.testing.assert_allclose(x[:, 0], 0.0, atol=1e-9)
+
+
+def test_parts_of_a_body_that_close_on_a_sheet_end_the_run_in_words(comm: MPI.Comm, shared_tmp: Path) -> None:
+    content = shared(comm, shared_tmp, 0.06)
+    with Simulation(content, comm=comm) as simulation:
+        with pytest.raises(
+            SolverError, match=r"something would pass through the sheet: .*obstacle 'body'"
+        ) as caught:
+            for _ in simulation:
+                pass
+        assert "try more space for the sheet" in str(caught.value)
+        # the parts meet at 0.05 s, in the plane of the sheet
+        assert 0.04 <= simulation.time <= 0.05
+        x = simulation.gather(simulation.positions)
+    if comm.rank == 0:
+        np.testing.assert_allclose(x[:, 0], 0.0, atol=0.004)
+
+
+def shared(comm: MPI.Comm, folder: Path, high: float) -> dict[str, Any]:
+    """The scene of `closing_boxes`, whose files rank 0 writes; collective."""
+    content = closing_boxes(folder, high) if comm.rank == 0 else None
+    return dict(comm.bcast(content))
