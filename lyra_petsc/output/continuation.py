@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,21 +20,26 @@ from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.stored import open_stored, read_stored
 from lyra_petsc.output.xdmf import group_name
 from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.dump import Change, obstacle_motions, scene_changes
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.handles.motion import Motion
 
 
-def used_groups(scene: Scene) -> set[str]:
-    """Names of the mesh's groups that a scene uses."""
-    ends = [end for attachment in scene.attachments for end in (attachment.start, attachment.to)]
-    selectors = [*scene.handles, *scene.loads, *scene.probes.values(), *ends]
-    names = {block.group for block in scene.material} | {selector.group for selector in selectors}
-    names |= {name for seam in scene.seams for name in seam.between}
-    return {name for name in names if name is not None}
+def used_groups(content: object, key: str = "") -> set[str]:
+    """Names of the mesh's groups that a scene, or a part of it, uses: values of ``group`` and ``between``."""
+    if isinstance(content, str):
+        return {content} if key in ("group", "between") else set()
+    parts: Iterable[tuple[str, object]] = ()
+    if isinstance(content, Block):
+        parts = content
+    elif isinstance(content, Mapping):
+        parts = (("", part) for part in content.values())
+    elif isinstance(content, Sequence):
+        parts = ((key, part) for part in content)
+    return set().union(*(used_groups(part, name) for name, part in parts))
 
 
 def term_arrays(simulation: SteppedScene) -> TermArrays:

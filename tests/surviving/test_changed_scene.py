@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 from launch import DIRECT, done, lyra, read_json, write_scene
 from leftovers import SHEET, announced, steps
+from physics import CLOTH, grid, scene_of
+
+from lyra_petsc.output.continuation import used_groups
 
 SCENE = SHEET % 0.04
 
@@ -156,3 +159,18 @@ def test_another_member_of_a_group_is_refused(tmp_path: Path) -> None:
     assert "group 'pole' has other members" in left.ours[0]
     (tmp_path / "mesh.msh").write_text(GROUPS.format(held=1))
     done(["run", scene, "--out", "out", "--resume"], tmp_path, 2)
+
+
+def test_the_groups_that_a_scene_uses_are_found_in_all_its_blocks() -> None:
+    """Where one of them has other vertices, the run cannot be continued."""
+    blocks = {
+        "material": [{"group": "m", "density": 0.1, "membrane": CLOTH["membrane"]}],
+        "handles": [{"group": "h"}, {"nodes": [0]}],
+        "loads": [{"gas": {"group": ["g", "g2"], "pressure": 1.0}}, {"group": "l", "pressure": 1.0}],
+        "seams": [{"between": ["s", "s2"]}],
+        "creases": [{"group": "c", "angle": 90.0, "stiffness": 1.0}],
+        "attachments": [{"from": {"group": "f"}, "to": {"group": "t"}, "stiffness": 1.0}],
+        "probes": {"group": {"group": "p"}},
+    }
+    scene = scene_of({"mesh": grid(1, 1, 2, 2)} | blocks)
+    assert used_groups(scene) == {"m", "h", "g", "g2", "l", "s", "s2", "c", "f", "t", "p"}
