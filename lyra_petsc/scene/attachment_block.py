@@ -55,7 +55,8 @@ class Attachment(Block):
     length : float [m] or "start"
         Distance at which the springs are free of force; ``start``: their distances at the start.
     breaks_at : float [N] or None
-        A spring whose force is larger at the end of a step is gone for good; its energy becomes heat.
+        A spring whose force is larger at the end of a step is gone for good; its energy becomes heat. A
+        static analysis stays at such a load factor until nothing breaks any more.
     """
 
     start: AttachmentEnd = Field(alias="from")
