@@ -291,22 +291,23 @@ def jerked(integrator: str, model: str, step: float) -> dict[str, Any]:
     }
 
 
-JERKED = [("beuler", "midedge"), ("midpoint", "midedge"), ("bdf2", "midedge"), ("alpha2", "midedge")]
+BOUNDS = {"beuler": 1.5, "semi-implicit": 2.5, "midpoint": 0.03, "bdf2": 0.03, "alpha2": 0.03}
+"""Largest part of the heat that may be missing."""
 
 
-@pytest.mark.parametrize(("integrator", "model"), [*JERKED, ("bdf2", "hinge")])
-def test_works_of_a_jerk_are_stored_or_heat(integrator: str, model: str) -> None:
+@pytest.mark.parametrize("integrator", BOUNDS)
+def test_works_of_a_jerk_are_stored_or_heat(integrator: str) -> None:
     lost = []
     for step in (2.5e-4, 1.25e-4):
-        with stepped(MPI.COMM_SELF, jerked(integrator, model, step)) as simulation:
+        with stepped(MPI.COMM_SELF, jerked(integrator, "midedge", step)) as simulation:
             while not simulation.finished:
                 simulation.step()
             budget = simulation.budget
         assert budget.dissipation > 3e-4
         lost.append((budget.total + budget.dissipation - budget.external_work) / budget.dissipation)
-    # backward Euler damps waves of bending, which the jerk makes, in first order
-    bound, part = (1.5, 0.8) if integrator == "beuler" else (0.03, 0.35)
-    assert abs(lost[1]) < bound
+    # integrators of first order damp waves of bending, which the jerk makes, in first order
+    part = 0.35 if BOUNDS[integrator] < 1.0 else 0.8
+    assert abs(lost[1]) < BOUNDS[integrator]
     assert abs(lost[1]) < part * abs(lost[0]) or abs(lost[1]) < 0.003, lost
 
 
