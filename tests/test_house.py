@@ -102,7 +102,7 @@ def test_names_of_classes_and_modules_occur_once() -> None:
 
 OF_CONTACT = {
     "SceneContact", "set_up_terms", "Barrier", "barrier", "RefusedDisplacement", "ContactModel", "NearPair",
-    "Overlaps", "behind_wall", "find_overlaps", "refuse_crossings", "StartCrossings",
+    "Overlaps", "behind_wall", "find_overlaps", "PlacedScene", "StartCrossings", "find_start_crossings",
     "have_common_vertex", "self_crossings", "untangle", "crossings_beside_seams",
 }  # fmt: skip
 """All that other packages import from `lyra_petsc.contact`."""

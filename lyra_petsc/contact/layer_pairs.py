@@ -8,11 +8,12 @@ such pair changes sides do not cross.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.contact.joined import JoinedVertices
 from lyra_petsc.contact.near import overlapping_pairs
 from lyra_petsc.mesh.topology import connected_components, connected_pieces, enclosed_volumes, unique_edges
 
@@ -21,6 +22,10 @@ SMOOTHING = 60
 
 STEEP = 0.2
 """Cosine between direction and normal of a triangle below which it does not lie above or below anything."""
+
+TILT = 0.1
+"""Tangent of the angle by which directions may be wrong: vertices of sheets that pass triangles of sheets by
+that part of the height count as above or below them."""
 
 REACH, PART = 8.0, 1.0 / 6.0
 """Height up to which pairs are known: over the mean edge, and at most over the size of the smallest piece."""
@@ -34,6 +39,10 @@ OTHER_SURFACE = 2.0
 
 RINGS = 30
 """Width, in edges, of the patches around a contour in which a sheet crosses itself."""
+
+
+Boxes: TypeAlias = tuple[Array, Array]
+"""Low and high corners (n, 3) [m]."""
 
 
 class Surfaces(NamedTuple):
@@ -122,6 +131,16 @@ class LayerPairs(NamedTuple):
     slope: Array
     n_vertex_pairs: int
 
+    def at_seams(self, joined: JoinedVertices) -> Mask:
+        """Whether seams hold a vertex of the first part together with one of the second, (n,)."""
+        rows = joined.concern(self.points)
+        first = np.arange(4) < np.where(rows < self.n_vertex_pairs, 1, 2)[:, None]
+        held = joined.between(self.points[rows], self.points[rows])
+        held &= first[:, :, None] & ~first[:, None, :]
+        at_seam = np.zeros(len(self.points), dtype=bool)
+        at_seam[rows] = held.any(axis=(1, 2))
+        return at_seam
+
     def heights(self, x: Array) -> Array:
         """(n,) heights [m] of the first above the second part at positions x (V, 3) [m]."""
         return np.einsum("ni,nk,nki->n", self.directions, self.weights, x[self.points], optimize=True)
@@ -131,27 +150,36 @@ def find_layer_pairs(surfaces: Surfaces, x: Array, within: Mask) -> LayerPairs:
     """The pairs at positions x (V, 3) [m] of different pieces, not both of obstacles, and within the pieces
     for which ``within`` (pieces,) is true.
     """
-    parts = [_vertex_pairs(surfaces, x, within), _edge_pairs(surfaces, x, within)]
-    joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-    return LayerPairs(joined[0], joined[1], joined[2], joined[3], len(parts[0][0]))
+    number = np.arange(len(within))
+    may = (number[:, None] != number) & (np.minimum(number[:, None], number) < surfaces.n_sheets)
+    may |= np.diag(within)
+    # in the principal axes of the normals, boxes around layers along them are flat
+    axes = np.linalg.eigh(surfaces.normals.T @ surfaces.normals)[1]
+    turned, there = surfaces._replace(normals=surfaces.normals @ axes), x @ axes
+    parts = [_vertex_pairs(turned, there, may), _edge_pairs(turned, there, np.triu(may))]
+    points, weights, directions, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return LayerPairs(points, weights, directions @ axes.T, slope, len(parts[0][0]))
 
 
-def _may_pair(surfaces: Surfaces, first: Ints, second: Ints, within: Mask) -> Mask:
-    """Whether points of pieces ``first`` and ``second`` (n,) may be a pair."""
-    n = surfaces.n_sheets
-    return ((first != second) & ((first < n) | (second < n))) | ((first == second) & within[first])
+def _candidates(may: Mask, first: Ints, boxes: Boxes, second: Ints, others: Boxes) -> Ints:
+    """Numbers (n, 2) of boxes and others that overlap; those of the pieces ``first`` (k,) and ``second`` (m,)
+    are examined that ``may`` (pieces, pieces) be pairs.
+    """
+    lists = [np.empty((0, 2), dtype=np.int64)]
+    for piece in np.unique(first):
+        rows, columns = np.flatnonzero(first == piece), np.flatnonzero(may[piece][second])
+        pairs = overlapping_pairs((boxes[0][rows], boxes[1][rows]), (others[0][columns], others[1][columns]))
+        lists.append(np.column_stack([rows[pairs[:, 0]], columns[pairs[:, 1]]]))
+    return np.concatenate(lists)
 
 
-def _vertex_pairs(surfaces: Surfaces, x: Array, within: Mask) -> tuple[Ints, Array, Array, Array]:
-    triangles, normals = surfaces.triangles, surfaces.normals
+def _vertex_pairs(surfaces: Surfaces, x: Array, may: Mask) -> tuple[Ints, Array, Array, Array]:
+    triangles, normals, piece = surfaces.triangles, surfaces.normals, surfaces.piece
     swept = np.stack([x - surfaces.reach * normals, x + surfaces.reach * normals])
     corners = x[triangles]
-    candidates = overlapping_pairs(
-        (swept.min(axis=0), swept.max(axis=0)), (corners.min(axis=1), corners.max(axis=1))
-    )
-    v, t = candidates.T
-    keep = _may_pair(surfaces, surfaces.piece[v], surfaces.piece[triangles[t, 0]], within)
-    keep &= (triangles[t] != v[:, None]).all(axis=1)
+    boxes, others = (swept.min(axis=0), swept.max(axis=0)), (corners.min(axis=1), corners.max(axis=1))
+    v, t = _candidates(may, piece, boxes, piece[triangles[:, 0]], others).T
+    keep = (triangles[t] != v[:, None]).all(axis=1)
     v, t = v[keep], t[keep]
     a, b, c = (x[triangles[t, k]] for k in range(3))
     direction, normal = normals[v], np.cross(b - a, c - a)
@@ -167,23 +195,26 @@ def _vertex_pairs(surfaces: Surfaces, x: Array, within: Mask) -> tuple[Ints, Arr
     w_b = np.einsum("ni,ni->n", np.cross(foot - a, c - a), normal) / square
     w_c = np.einsum("ni,ni->n", np.cross(b - a, foot - a), normal) / square
     w_a = 1.0 - w_b - w_c
-    keep = (np.minimum(np.minimum(w_a, w_b), w_c) >= 0.0) & (np.abs(height) <= surfaces.reach)
+    of_sheets = np.maximum(piece[v], piece[triangles[t, 0]]) < surfaces.n_sheets
+    aside = np.where(of_sheets, TILT, 0.0) * np.abs(height) / np.sqrt(size)
+    keep = (np.minimum(np.minimum(w_a, w_b), w_c) >= -aside) & (np.abs(height) <= surfaces.reach)
     weights = np.column_stack([np.ones_like(w_a), -w_a, -w_b, -w_c])[keep]
     points = np.column_stack([v, triangles[t]])[keep]
     return points, weights, direction[keep], (np.abs(rise) / size)[keep]
 
 
-def _edge_pairs(surfaces: Surfaces, x: Array, within: Mask) -> tuple[Ints, Array, Array, Array]:
+def _edge_pairs(surfaces: Surfaces, x: Array, may: Mask) -> tuple[Ints, Array, Array, Array]:
     edges, normals = surfaces.edges, surfaces.normals
     mean = unit(normals[edges].sum(axis=1))
     ends = x[edges]
     low, high = ends.min(axis=1), ends.max(axis=1)
     offset = surfaces.reach * np.abs(mean)
-    candidates = overlapping_pairs((low - offset, high + offset), (low, high))
-    candidates = candidates[candidates[:, 0] < candidates[:, 1]]
+    piece = surfaces.piece[edges[:, 0]]
+    candidates = _candidates(may, piece, (low - offset, high + offset), piece, (low, high))
+    own, other = piece[candidates.T]
+    candidates = candidates[(own != other) | (candidates[:, 0] < candidates[:, 1])]
     first, second = edges[candidates[:, 0]], edges[candidates[:, 1]]
-    keep = _may_pair(surfaces, surfaces.piece[first[:, 0]], surfaces.piece[second[:, 0]], within)
-    keep &= (first[:, :, None] != second[:, None, :]).all(axis=(1, 2))
+    keep = (first[:, :, None] != second[:, None, :]).all(axis=(1, 2))
     first, second, candidates = first[keep], second[keep], candidates[keep]
     one, two = mean[candidates[:, 0]], mean[candidates[:, 1]]
     sign = np.where(np.einsum("ni,ni->n", one, two) < 0.0, -1.0, 1.0)
@@ -208,56 +239,90 @@ def _edge_pairs(surfaces: Surfaces, x: Array, within: Mask) -> tuple[Ints, Array
     return points[keep], weights[keep], direction[keep], (np.abs(rise) / size)[keep]
 
 
-def wanted_sides(surfaces: Surfaces, x: Array, pairs: LayerPairs, crossings: Ints) -> tuple[Array, Mask]:
-    """The sign (n,) that the height of each pair is to have, and whether it has the other one now, as the
-    overlap of the ``crossings`` (m, 2) of triangles has moved the parts to the wrong side.
+class Overlap(NamedTuple):
+    """Parts of two surfaces, of which one has moved through the other.
+
+    Attributes
+    ----------
+    first, second : (V,) bool
+        Points of either; of the first one if it is an obstacle.
+    seeds : (V,) bool
+        Points that are known to be at the overlap.
+    outside : bool
+        Whether the first one is a closed obstacle, of which the second is to be outside.
+    """
+
+    first: Mask
+    second: Mask
+    seeds: Mask
+    outside: bool
+
+
+def wanted_sides(
+    surfaces: Surfaces, x: Array, pairs: LayerPairs, crossings: Ints, enclosed: Ints
+) -> tuple[Array, Mask]:
+    """The sign (n,) that the height of each pair is to have, and whether it has the other one now.
+
+    The overlap of the ``crossings`` (m, 2) of triangles has moved parts to the wrong side, or pieces lie in
+    others: ``enclosed`` (k, 2) are a sheet and a closed piece of an obstacle around it.
 
     Along each contour of crossings the greater part of both surfaces, by area, is on the right side; of a
     closed obstacle it is the outside.
     """
     heights = pairs.heights(x)
-    side, wrong = np.where(heights < 0.0, -1.0, 1.0), np.zeros(len(heights), dtype=bool)
-    for contour in _contours(surfaces, crossings):
-        (one, first), (two, second) = (_patch(surfaces, contour, role) for role in (0, 1))
-        own, other = surfaces.piece[surfaces.triangles[contour[0], 0]]
-        of_one, of_two = (one < two, two < one) if own == other else (np.isfinite(one), np.isfinite(two))
-        in_one, in_two = of_one[pairs.points], of_two[pairs.points]
-        count = np.where(np.arange(len(heights)) < pairs.n_vertex_pairs, 1, 2)
-        leading = np.arange(4) < count[:, None]
-        forward = np.where(leading, in_one, in_two).all(
-            axis=1
-        )  # first part of the pair is of the first piece
-        backward = np.where(leading, in_two, in_one).all(axis=1)
-        chosen = np.flatnonzero(forward | backward)
-        # the direction, turned to the normals of the first surface
-        theirs = surfaces.normals[np.where(forward[chosen], pairs.points[chosen, 0], pairs.points[chosen, 3])]
-        turned = np.sign(np.einsum("ni,ni->n", theirs, pairs.directions[chosen]))
-        # height of the second above the first surface is factor · height of the pair
-        factor = np.where(forward[chosen], -1.0, 1.0) * np.where(turned == 0.0, 1.0, turned)
-        relative = factor * heights[chosen]
-        of_vertex = chosen < pairs.n_vertex_pairs
-        at = pairs.points[chosen[of_vertex], 0]
-        sign = _vertex_signs(at, relative[of_vertex], len(x))
-        least = np.full(len(x), np.inf)
-        np.minimum.at(least, at, np.abs(relative[of_vertex]))
-        seeds = np.zeros(len(x), dtype=bool)
-        seeds[first] = seeds[second] = True
-        regions = {s: _flood(surfaces.edges, sign == s, seeds) for s in (-1.0, 1.0)}
-        right = surfaces.outward[own] ** 2
-        if right == 0.0:
-            areas = {s: float(surfaces.area[region].sum()) for s, region in regions.items()}
-            right = max(areas, key=lambda s: areas[s])
-        touched = regions[-right] | seeds
-        parts = least[pairs.points[chosen]]
-        parts = np.where(np.isfinite(parts), parts, 0.0)
-        limit = np.full(len(chosen), np.inf)
-        for part in (leading[chosen], ~leading[chosen]):
-            height = np.where(part, parts, 0.0).max(axis=1)
-            limit = np.where(height > 0.0, np.minimum(limit, height), limit)
-        nearest = np.abs(relative) <= OTHER_SURFACE * limit
-        flips = chosen[nearest & (relative * right < 0.0) & touched[pairs.points[chosen]].any(axis=1)]
-        wrong[flips] = True
-    return np.where(wrong, -side, side), wrong
+    wrong = np.zeros(len(heights), dtype=bool)
+    overlaps = [_overlap_at(surfaces, contour) for contour in _contours(surfaces, crossings)]
+    for sheet, body in enclosed:
+        inside = surfaces.piece == sheet
+        overlaps.append(Overlap(surfaces.piece == body, inside, inside, outside=True))
+    for overlap in overlaps:
+        wrong[_on_the_wrong_side(surfaces, pairs, heights, overlap)] = True
+    return np.where((heights < 0.0) ^ wrong, -1.0, 1.0), wrong
+
+
+def _overlap_at(surfaces: Surfaces, contour: Ints) -> Overlap:
+    """The overlap at a contour of crossings."""
+    (one, first), (two, second) = (_patch(surfaces, contour, role) for role in (0, 1))
+    own, other = surfaces.piece[surfaces.triangles[contour[0], 0]]
+    seeds = np.zeros(len(one), dtype=bool)
+    seeds[first] = seeds[second] = True
+    of_one, of_two = (one < two, two < one) if own == other else (np.isfinite(one), np.isfinite(two))
+    return Overlap(of_one, of_two, seeds, bool(surfaces.outward[own] != 0.0))
+
+
+def _on_the_wrong_side(surfaces: Surfaces, pairs: LayerPairs, heights: Array, overlap: Overlap) -> Ints:
+    """The pairs that an overlap has moved to the wrong side."""
+    in_one, in_two = overlap.first[pairs.points], overlap.second[pairs.points]
+    count = np.where(np.arange(len(heights)) < pairs.n_vertex_pairs, 1, 2)
+    leading = np.arange(4) < count[:, None]
+    # whether the first part of the pair is of the first surface, or of the second
+    forward = np.where(leading, in_one, in_two).all(axis=1)
+    backward = np.where(leading, in_two, in_one).all(axis=1)
+    chosen = np.flatnonzero(forward | backward)
+    # the direction, turned to the normals of the first surface
+    theirs = surfaces.normals[np.where(forward[chosen], pairs.points[chosen, 0], pairs.points[chosen, 3])]
+    turned = np.sign(np.einsum("ni,ni->n", theirs, pairs.directions[chosen]))
+    # height of the second above the first surface is factor · height of the pair
+    factor = np.where(forward[chosen], -1.0, 1.0) * np.where(turned == 0.0, 1.0, turned)
+    relative = factor * heights[chosen]
+    of_vertex = chosen < pairs.n_vertex_pairs
+    at, n = pairs.points[chosen[of_vertex], 0], len(overlap.seeds)
+    sign = _vertex_signs(at, relative[of_vertex], n)
+    least = np.full(n, np.inf)
+    np.minimum.at(least, at, np.abs(relative[of_vertex]))
+    regions = {s: _flood(surfaces.edges, sign == s, overlap.seeds) for s in (-1.0, 1.0)}
+    areas = {s: float(surfaces.area[region].sum()) for s, region in regions.items()}
+    right = 1.0 if overlap.outside else max(areas, key=lambda s: areas[s])
+    touched = regions[-right] | overlap.seeds
+    parts = least[pairs.points[chosen]]
+    parts = np.where(np.isfinite(parts), parts, 0.0)
+    limit = np.full(len(chosen), np.inf)
+    for part in (leading[chosen], ~leading[chosen]):
+        height = np.where(part, parts, 0.0).max(axis=1)
+        limit = np.where(height > 0.0, np.minimum(limit, height), limit)
+    nearest = np.abs(relative) <= OTHER_SURFACE * limit
+    on_it = touched[pairs.points[chosen]].any(axis=1)
+    return np.asarray(chosen[nearest & (relative * right < 0.0) & on_it])
 
 
 def _contours(surfaces: Surfaces, crossings: Ints) -> list[Ints]:

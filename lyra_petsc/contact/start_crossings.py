@@ -9,6 +9,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact.crossings import mutual_crossings
+from lyra_petsc.contact.enclosed import enclosed_sheets
 from lyra_petsc.contact.joined import crossings_beside_seams
 from lyra_petsc.contact.overlaps import behind_wall, find_overlaps
 from lyra_petsc.errors import MarkedError
@@ -25,8 +26,30 @@ NOT_ANY = -1
 """Number that stands for no triangle, sheet or obstacle."""
 
 
+class PlacedScene(NamedTuple):
+    """Sheets and obstacles at a time.
+
+    Attributes
+    ----------
+    scene : Scene
+        A scene with ``contact``.
+    mesh : Mesh
+    positions : (V, 3) float64
+        Of the sheets [m].
+    obstacles : sequence of Solid or Container
+    time : float
+        Time [s] at which the obstacles are where they are.
+    """
+
+    scene: Scene
+    mesh: Mesh
+    positions: Array
+    obstacles: Sequence[Solid | Container]
+    time: float = 0.0
+
+
 class Crossing(NamedTuple):
-    """Triangles of sheets that cross each other, an obstacle or a symmetry plane.
+    """Triangles of sheets that cross each other, an obstacle or a symmetry plane, or lie in an obstacle.
 
     Attributes
     ----------
@@ -67,6 +90,8 @@ class StartCrossings(NamedTuple):
     obstacles : dict of str to TriangleSurface
         Obstacles that have triangles, at the time.
     crossings : list of Crossing
+    enclosed : list of Crossing
+        Sheets that lie wholly inside of closed meshes and so cross nothing.
     """
 
     scene: Scene
@@ -75,17 +100,54 @@ class StartCrossings(NamedTuple):
     names: list[str]
     obstacles: dict[str, TriangleSurface]
     crossings: list[Crossing]
+    enclosed: list[Crossing]
+
+    @property
+    def clear(self) -> bool:
+        """Whether nothing crosses, and no sheet is enclosed."""
+        return not (self.crossings or self.enclosed)
+
+    @property
+    def notes(self) -> list[str]:
+        """For the user, about what is not refused."""
+        return [
+            f"{one.key}: at the start {one.subject}{_which(self, one)}: they stay inside, as meshes keep "
+            f"sheets on both sides; else {one.remedy}"
+            for one in self.enclosed
+        ]
+
+    def refuse(self, when: str, why: str = "", *, enclosed: bool = False) -> None:
+        """Refuse a start if anything crosses ``when`` described, or is ``enclosed``, with a reason ``why`` in
+        the message.
+
+        Raises
+        ------
+        MarkedError
+            The message gives numbers, the sheets and the first triangles with their positions.
+        """
+        crossings = self.crossings + (self.enclosed if enclosed else [])
+        if not crossings:
+            return
+        key, texts = crossings[0].key, []
+        for number, crossing in enumerate(crossings):
+            prefix = f"{crossing.key}: " if number and crossing.key != key else ""
+            rows = range(len(crossing.triangles))[:MAX_LISTED]
+            listed = ", ".join(_named(self, crossing, row) for row in rows)
+            first = f" (counted from 0, the first: {listed})"
+            texts.append(f"{prefix}{crossing.subject}{first}{_which(self, crossing)}")
+        remedies = "; ".join(dict.fromkeys(crossing.remedy for crossing in crossings))
+        message = f"{when} {'; and '.join(texts)}; {why or remedies}"
+        raise MarkedError(message, self, file=self.scene.source, key=key)
 
 
-def find_start_crossings(
-    scene: Scene, mesh: Mesh, positions: Array, obstacles: Sequence[Solid | Container], time: float = 0.0
-) -> StartCrossings:
-    """Crossings of sheets with each other, symmetry planes and obstacles at ``positions`` (V, 3) [m] and a
-    time [s] of a scene with contact.
-    """
+def find_start_crossings(placed: PlacedScene) -> StartCrossings:
+    """Crossings of sheets with each other, symmetry planes and obstacles."""
+    scene, mesh, positions, obstacles, time = placed
     assert scene.contact is not None
     triangles = mesh.triangles
+    sheet, names = named_sheets(mesh)
     crossings: list[Crossing] = []
+    enclosed: list[Crossing] = []
     surfaces = {
         one.name: TriangleSurface(one.positions(time), one.triangles)
         for one in obstacles
@@ -126,66 +188,21 @@ def find_start_crossings(
                 segments = intersections(positions[triangles[pairs[:, 0]]], points[theirs[pairs[:, 1]]])
                 count = _counted(len(pairs), "pair", "of triangles of sheet and obstacle", "cross")
                 crossings.append(Crossing(key, number, pairs[:, 0], pairs[:, 1], segments, count, remedy))
+            inside, _ = enclosed_sheets(positions, triangles, sheet, points, theirs, pairs)
+            if inside.any():
+                within = np.flatnonzero(inside.any(axis=1)[sheet])
+                count = _counted(len(within), "triangle", "of the sheet", "lie", "s")
+                subject = f"{count} wholly inside of it"
+                enclosed.append(Crossing(key, number, *_alone(within), subject, remedy))
             continue
         is_box = shape.box is not None
-        inside = find_overlaps(obstacle, positions, triangles, time, is_box=is_box).triangles
-        if len(inside):
+        overlapping = find_overlaps(obstacle, positions, triangles, time, is_box=is_box).triangles
+        if len(overlapping):
             where = "into it" if isinstance(obstacle, Solid) else "beyond it"
-            count = _counted(len(inside), "triangle", "of the sheet", "reach")
-            crossings.append(Crossing(key, number, *_alone(inside), f"{count} {where}", remedy))
-    sheet, names = named_sheets(mesh)
-    return StartCrossings(scene, TriangleSurface(positions, triangles), sheet, names, surfaces, crossings)
-
-
-def refuse_crossings(
-    scene: Scene,
-    mesh: Mesh,
-    positions: Array,
-    obstacles: Sequence[Solid | Container],
-    time: float = 0.0,
-    when: str = "at the start",
-) -> None:
-    """Refuse positions at which a run begins or is resumed if triangles cross, or overlap an obstacle.
-
-    Parameters
-    ----------
-    scene : Scene
-        A scene with ``contact``.
-    mesh : Mesh
-    positions : (V, 3) float64
-        Positions [m].
-    obstacles : sequence of Solid or Container
-    time : float
-        Time [s] at which the obstacles are where they are, described by ``when``.
-
-    Raises
-    ------
-    MarkedError
-        The message gives numbers, the sheets and the first triangles with their positions.
-    """
-    refuse(find_start_crossings(scene, mesh, positions, obstacles, time), when)
-
-
-def refuse(start: StartCrossings, when: str, why: str = "") -> None:
-    """Refuse a start if anything crosses ``when`` described, with a reason ``why`` in the message.
-
-    Raises
-    ------
-    MarkedError
-    """
-    if not start.crossings:
-        return
-    key, texts = start.crossings[0].key, []
-    for number, crossing in enumerate(start.crossings):
-        prefix = f"{crossing.key}: " if number and crossing.key != key else ""
-        listed = ", ".join(
-            _named(start, crossing, row) for row in range(len(crossing.triangles))[:MAX_LISTED]
-        )
-        which = "".join(f", {text}" for text in _sheets(start, crossing))
-        texts.append(f"{prefix}{crossing.subject} (counted from 0, the first: {listed}){which}")
-    remedies = "; ".join(dict.fromkeys(crossing.remedy for crossing in start.crossings))
-    message = f"{when} {'; and '.join(texts)}; {why or remedies}"
-    raise MarkedError(message, start, file=start.scene.source, key=key)
+            count = _counted(len(overlapping), "triangle", "of the sheet", "reach")
+            crossings.append(Crossing(key, number, *_alone(overlapping), f"{count} {where}", remedy))
+    surface = TriangleSurface(positions, triangles)
+    return StartCrossings(scene, surface, sheet, names, surfaces, crossings, enclosed)
 
 
 def _named(start: StartCrossings, crossing: Crossing, row: int) -> str:
@@ -197,6 +214,11 @@ def _named(start: StartCrossings, crossing: Crossing, row: int) -> str:
         place = points[triangles[numbers[0]]].mean(axis=0)
     x, y, z = place
     return f"{' and '.join(map(str, numbers))} around ({x:.4g}, {y:.4g}, {z:.4g}) m"
+
+
+def _which(start: StartCrossings, crossing: Crossing) -> str:
+    """Numbers of triangles or pairs by sheets, to be added to a message."""
+    return "".join(f", {text}" for text in _sheets(start, crossing))
 
 
 def _sheets(start: StartCrossings, crossing: Crossing) -> Iterable[str]:
@@ -223,9 +245,9 @@ def _alone(triangles: Ints) -> tuple[Ints, Ints, Array]:
     return triangles, np.full_like(triangles, NOT_ANY), np.full((len(triangles), 2, 3), np.nan)
 
 
-def _counted(count: int, noun: str, of: str, verb: str) -> str:
+def _counted(count: int, noun: str, of: str, verb: str, ending: str = "es") -> str:
     """Subject and verb of a message: ``1 triangle of the sheet reaches``, ``2 triangles … reach``."""
-    return f"{count} {noun} {of} {verb}es" if count == 1 else f"{count} {noun}s {of} {verb}"
+    return f"{count} {noun} {of} {verb}{ending}" if count == 1 else f"{count} {noun}s {of} {verb}"
 
 
 def intersections(first: Array, second: Array) -> Array:

@@ -132,13 +132,14 @@ def refuse_crossing_positions(simulation: SteppedScene, positions: Array) -> Non
     ------
     InputError
     """
-    from lyra_petsc.contact.start_crossings import refuse_crossings  # with kernels
+    from lyra_petsc.contact.start_crossings import PlacedScene, find_start_crossings  # with kernels
     from lyra_petsc.mesh.obstacles import build_obstacles
 
     scene, mesh = simulation.scene, simulation.problem.mesh
     if mesh is not None:
         obstacles = build_obstacles(scene, mesh.obstacles, Motion)
-        refuse_crossings(scene, mesh, positions, obstacles, simulation.time, f"at {simulation.time_text()}")
+        placed = PlacedScene(scene, mesh, positions, obstacles, simulation.time)
+        find_start_crossings(placed).refuse(f"at {simulation.time_text()}")
 
 
 def first_positions(folder: Path, order: FileOrder, *, otherwise: Array) -> Array:

@@ -259,21 +259,24 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
     if scene.initial is not None:
         data |= start_positions(scene.initial, mesh, held)
         data |= start_velocities(scene.initial, mesh, rest.mass, file=scene.source)
-    positions, limits, untangling = None, _barrier(rest), None
+    positions, limits, untangling, start_notes = None, _barrier(rest), None, []
     if scene.contact is not None and limits is not None:
-        from lyra_petsc.contact.start_crossings import refuse_crossings  # with kernels
+        from lyra_petsc.contact.start_crossings import PlacedScene, find_start_crossings  # with kernels
         from lyra_petsc.mesh.obstacles import build_obstacles
 
         positions, bodies = data.get("start", mesh.positions), build_obstacles(scene, mesh.obstacles, Motion)
         _refuse_unconnected(scene, mesh, positions)
-        if scene.contact.untangle:
+        placed = PlacedScene(scene, mesh, positions, bodies)
+        crossings = find_start_crossings(placed)
+        if scene.contact.untangle and not crossings.clear:
             from lyra_petsc.contact.untangle import untangle  # needed by few scenes
 
-            untangling = untangle(scene, mesh, positions, bodies, limits.gap, held)
-        if untangling is None:
-            refuse_crossings(scene, mesh, positions, bodies)
-        else:
+            untangling = untangle(placed, crossings, limits.gap, held)
             positions = data["start"] = untangling.positions
+            start_notes = [untangling.note]
+        else:
+            crossings.refuse("at the start")
+            start_notes = crossings.notes
     if mesh.tags is not None:
         data["tag"] = mesh.tags.astype(np.float64)
     whole = WholeProblem(
@@ -290,7 +293,7 @@ def _prepare(scene: Scene, mesh: Mesh, owner: Ints | None) -> tuple[WholeProblem
             *scene.notes,
             *mesh.notes,
             *rest.notes,
-            *([] if untangling is None else [untangling.note]),
+            *start_notes,
             *unit_notes(rest),
             *conflicts(scene, mesh, held),
             *clamps_without_edges(scene, mesh, held),

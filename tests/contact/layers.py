@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from brute_force import depth_of_overlap
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle
 
 
 class Layers(NamedTuple):
-    """Sheets that cross: points (V, 3) [m] and triangles (F, 3) of each, and the depth [m]."""
+    """Sheets that cross: points (V, 3) [m] and triangles (F, 3) of each, and the depth [m] of the overlap."""
 
     kind: str
     sheets: list[tuple[Array, Ints]]
@@ -47,6 +48,7 @@ def random_layers(seed: int, cells: int = 30) -> Layers:
         if number:
             _deform(random, kind, x, depth + distance, size)
         sheets.append((x, triangles))
+    depth = depth_of_overlap(sheets)
     if kind == "curved":
         radius = size * random.uniform(0.4, 1.0)
         for x, _ in sheets:
