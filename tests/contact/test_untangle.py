@@ -22,8 +22,6 @@ from lyra_petsc.errors import MarkedError
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.seams import sewn_curves
-from lyra_petsc.phases import Phases
-from lyra_petsc.stepping.simulation import SteppedScene
 
 GAP = 0.2 * EDGE
 
@@ -211,26 +209,6 @@ def test_the_same_start_on_any_number_of_ranks(comm: MPI.Comm, shared_tmp: Path)
     held = (alone[:, 0] == 0.0) | (alone[:, 0] == 0.3)
     assert held.sum() == 4 * 16
     assert set(alone[held, 2]) == {0.0, 0.002}
-
-
-def equilibrium(scene: dict[str, Any]) -> tuple[float, str]:
-    """Energy [J] of the equilibrium, and the notes."""
-    scene = scene | {"time": {"analysis": "static"}}
-    simulation = SteppedScene(MPI.COMM_SELF, scene_of(scene), Phases())
-    try:
-        while not simulation.finished:
-            simulation.step()
-        return simulation.budget.total, " ".join(simulation.notes)
-    finally:
-        simulation.destroy()
-
-
-def test_the_equilibrium_is_that_of_a_start_apart(tmp_path: Path) -> None:
-    apart, no_note = equilibrium(dented(tmp_path, 0.0))
-    crossing, note = equilibrium(dented(tmp_path, 0.03))
-    assert "untangled the start: " in note
-    assert "untangled" not in no_note
-    assert crossing == pytest.approx(apart, rel=0.01)
 
 
 def test_what_cannot_be_resolved_is_refused(tmp_path: Path) -> None:
