@@ -1,7 +1,7 @@
 """Small scenes with each feature, and with several at once; a new feature is one more entry of `FEATURES`.
 
 They are run with every integrator and both bending models, stopped and resumed on changing numbers of ranks
-(``output/test_combinations.py``), and shown by the commands (``cli/test_combined_commands.py``).
+(``output/test_combinations.py``).
 """
 
 from __future__ import annotations
