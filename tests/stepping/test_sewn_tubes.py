@@ -1,4 +1,4 @@
-"""Seams of rolled rectangles and of tubes: against closed tubes, and with closed curves."""
+"""Seams of rolled rectangles and of tubes: against closed tubes, with closed curves, on ranks, resumed."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import finished, scene_of, shape
-from sewn_tubes import LENGTH, RADIUS, tube
+from physics import end_on_one_rank, finished, scene_of, shape
+from sewn_tubes import GAPING, LENGTH, RADIUS, tube
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.build import build_scene_mesh
-from lyra_petsc.mesh.seams import sewn_curves
+from lyra_petsc.mesh.seams import AT_VERTEX, sewn_curves
+from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.seam import SeamThreads
 
 pytestmark = [pytest.mark.parallel]
 
@@ -47,6 +49,15 @@ def final(comm: MPI.Comm, content: dict[str, Any]) -> Array:
         return shape(simulation)
 
 
+def largest_gap(simulation: SteppedScene) -> float:
+    """Of all seams [m], over the mean edge of the mesh."""
+    term = simulation.problem.terms["seam"]
+    assert isinstance(term, SeamThreads)
+    here = simulation.problem.equations.here()
+    rows = term.table_rows(here.x, here.frozen[term])
+    return max(float(gap) for _, gap, *_ in rows) / simulation.problem.whole.spacing
+
+
 @pytest.mark.parametrize("model", ["hinge", "midedge"])
 @pytest.mark.parametrize("flat", [True, False])
 def test_a_rolled_rectangle_that_is_sewn_equals_the_closed_tube(
@@ -62,6 +73,21 @@ def test_a_rolled_rectangle_that_is_sewn_equals_the_closed_tube(
     if model == "hinge" and flat:
         free = final(comm, inflated(written(comm, shared_tmp / "free.obj"), model, 1e-3, [LINE]))
         assert np.abs(free - closed).max() > 1e-3 * LENGTH
+
+
+@pytest.mark.parametrize(("model", "bending"), [("hinge", 1e-3), ("midedge", 1e-5)])
+def test_a_rolled_rectangle_that_is_pulled_together_equals_the_closed_tube(
+    comm: MPI.Comm, model: str, bending: float, shared_tmp: Path
+) -> None:
+    closed = final(comm, inflated(written(comm, shared_tmp / "closed.obj", closed=True), model, bending, []))
+    seam = LINE | {"angle": 0.0, "close": {"until": 0.5}}
+    content = inflated(written(comm, shared_tmp / "open.obj", front=GAPING), model, bending, [seam])
+    mesh = build_scene_mesh(scene_of(content))
+    gaps = mesh.positions[mesh.groups["one"].vertices] - mesh.positions[mesh.groups["other"].vertices]
+    np.testing.assert_allclose(np.linalg.norm(gaps, axis=1), 0.05 * 2 * np.pi * RADIUS, rtol=0.03)
+    sewn = final(comm, content).reshape(-1, AROUND + 1, 3)
+    np.testing.assert_allclose(sewn[:, :-1].reshape(-1, 3), closed, rtol=0.0, atol=1e-4 * LENGTH)
+    np.testing.assert_allclose(sewn[:, -1], closed[::AROUND], rtol=0.0, atol=1e-4 * LENGTH)
 
 
 def two_tubes(comm: MPI.Comm, folder: Path, gap: float, **seam: Any) -> dict[str, Any]:
@@ -81,6 +107,27 @@ def two_tubes(comm: MPI.Comm, folder: Path, gap: float, **seam: Any) -> dict[str
     }
 
 
+CLOSING = {"close": {"until": 0.06}}
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "midpoint"])
+def test_tubes_are_sewn_end_to_end(comm: MPI.Comm, integrator: str, shared_tmp: Path) -> None:
+    content = two_tubes(comm, shared_tmp, 0.01, angle=0.0, **CLOSING)
+    content["time"]["integrator"] = integrator
+    with finished(comm, content) as simulation:
+        assert largest_gap(simulation) < AT_VERTEX
+        x = shape(simulation)
+    assert x[:, 0].max() < 2.0 * LENGTH + 0.005
+
+
+def test_tubes_are_sewn_end_to_end_in_equilibrium(comm: MPI.Comm, shared_tmp: Path) -> None:
+    content = two_tubes(comm, shared_tmp, 0.01, angle=0.0, close={"until": 0.5})
+    content["loads"], content["gravity"] = [{"pressure": 50.0}], [0.0, 0.0, 0.0]
+    content["time"] = {"analysis": "static", "step": 0.25}
+    with finished(comm, content) as simulation:
+        assert largest_gap(simulation) < AT_VERTEX
+
+
 def test_closed_curves_begin_at_the_start_and_run_in_the_nearer_direction(
     comm: MPI.Comm, shared_tmp: Path
 ) -> None:
@@ -98,3 +145,25 @@ def test_closed_curves_begin_at_the_start_and_run_in_the_nearer_direction(
         turned = [np.arctan2(x[1:, 2], x[1:, 1]) - np.arctan2(x[:-1, 2], x[:-1, 1]) for x in (first, second)]
         turned = [np.sign(np.angle(np.exp(1j * steps)).sum()) for steps in turned]
         assert (turned[0] == turned[1]) != reverse
+
+
+@pytest.mark.parallel(alone=False)
+@pytest.mark.parametrize(
+    ("model", "integrator", "steps"),
+    [("hinge", "beuler", 9), ("midedge", "bdf2", 3), ("hinge", "midpoint", 3)],
+)
+def test_ranks_agree_and_a_run_goes_on_on_another_number(
+    comm: MPI.Comm, model: str, integrator: str, steps: int, shared_tmp: Path
+) -> None:
+    """From a checkpoint while the seam closes, and from one after that."""
+    content = two_tubes(comm, shared_tmp, 0.01, angle=0.0, bending=1e-4, **CLOSING)
+    content["time"]["integrator"] = integrator
+    content["material"]["bending_model"] = model
+    scene = scene_of(content)
+    with finished(comm, scene) as simulation:
+        x = shape(simulation)
+    with finished(MPI.COMM_SELF, scene) as alone:
+        np.testing.assert_allclose(x, shape(alone), rtol=0.0, atol=1e-7)
+    resumed = end_on_one_rank(comm, scene, shared_tmp / "run", steps)
+    if resumed is not None:
+        np.testing.assert_allclose(resumed, x, rtol=0.0, atol=1e-7)
