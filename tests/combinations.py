@@ -139,7 +139,7 @@ FEATURES: dict[str, dict[str, Any]] = {
     "untangled": {
         "mesh": [panel("front", [0, 0, 0]), panel("back", [0.02, 0.01, -4e-3], axis=[1, 0, 0], degrees=3)],
         "contact": {"gap": 4e-3, "untangle": True},
-        "handles": [*HELD, {"group": "back/left"}],
+        "handles": [*HELD, {"group": "back/right"}],
     },
     "all": {
         "mesh": [*box(0.25)["mesh"], *beside(0.01)],
