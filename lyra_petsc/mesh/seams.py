@@ -7,6 +7,7 @@ straight and evenly stretched: between common points both are linear, so each ti
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import product
 from typing import NamedTuple
 
@@ -57,6 +58,11 @@ class SeamSide(NamedTuple):
     def reversed(self) -> SeamSide:
         """The same from its other end."""
         return SeamSide(self.vertices[::-1].copy(), self.length - self.place[::-1])
+
+    def steps(self) -> list[tuple[int, int]]:
+        """The edges, each with its lower vertex first."""
+        ends = np.sort(np.stack([self.vertices[:-1], self.vertices[1:]], axis=1), axis=1)
+        return [(a, b) for a, b in ends.tolist()]
 
     def shares(self) -> Array:
         """Arc length [m] that belongs to each vertex, (own,)."""
@@ -284,7 +290,8 @@ def _curve(mesh: Mesh, edges: _Edges, name: str, key: str, file: object | None) 
 def join_seams(scene: Scene, mesh: Mesh) -> Mesh:
     """The mesh with vertices joined that rigid seams hold together where they coincide at the start.
 
-    ``tied`` gets the pairs of vertices of the other seams.
+    ``tied`` gets the pairs of vertices of the other seams. Those that share an edge are among these: where
+    three sheets became one edge, it would not tell which two of them a seam bends.
 
     Raises
     ------
@@ -295,12 +302,15 @@ def join_seams(scene: Scene, mesh: Mesh) -> Mesh:
     same: Ints = np.arange(mesh.n_vertices)
     edge, edges = mean_edge_length(mesh), _Edges(mesh)
     taken: set[tuple[int, int, frozenset[str]]] = set()
-    for number, (seam, sewn) in enumerate(zip(scene.seams, sewn_curves(scene, mesh), strict=True)):
+    curves = sewn_curves(scene, mesh)
+    seams_at = Counter(step for sewn in curves for side in sewn.sides for step in side.steps())
+    for number, (seam, sewn) in enumerate(zip(scene.seams, curves, strict=True)):
         key = f"seams[{number}].between"
         for curve in sewn.sides:
             _check_boundary(curve, edges, frozenset(seam.between), taken, key, scene.source)
         one, other = sewn.sides
-        if seam.rigid and one.own == other.own:
+        alone = all(seams_at[step] == 1 for side in sewn.sides for step in side.steps())
+        if seam.rigid and alone and one.own == other.own:
             pairs = np.stack([one.vertices, other.vertices])
             apart = np.linalg.norm(np.subtract(*mesh.positions[pairs]), axis=1)
             if apart.max() <= SAME_PLACE * edge:
@@ -426,9 +436,9 @@ def _check_boundary(
     """Refuse edges of more than one triangle, and those that are sewn to themselves or twice to the same
     ``pair`` of groups; ``taken`` gets the edges. Three sheets meet in several seams.
     """
-    steps = np.sort(np.stack([curve.vertices[:-1], curve.vertices[1:]], axis=1), axis=1)
-    _, count = edges.of(steps)
-    for (a, b), triangles in zip(steps.tolist(), count.tolist(), strict=True):
+    steps = curve.steps()
+    _, count = edges.of(np.array(steps))
+    for (a, b), triangles in zip(steps, count.tolist(), strict=True):
         if triangles > 1:
             raise InputError(f"edge {a}-{b} is inside the sheet; sew boundary edges", key=key, file=file)
         if (a, b, pair) in taken:

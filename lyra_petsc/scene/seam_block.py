@@ -65,7 +65,8 @@ class Seam(Block):
         For closed curves: the vertices nearest to this point at the start are where both curves begin.
     close : Closing or None
         Time in which threads pull the seam together; without it the seam is closed from the beginning. Where
-        the vertices of both sides coincide at the start and the seam is rigid, they become one.
+        the vertices of both sides coincide at the start, the seam is rigid, and no other seam has edges of
+        theirs, they become one.
     stiffness : "rigid" or float [N/m²]
         Force per length of the seam and distance of its sides; ``rigid``: 1000 times the membrane stiffness
         over the edge length, so that the sides are less than 1e-4 of an edge apart at strains up to 10 %.

@@ -95,6 +95,22 @@ def test_a_seam_opens_under_a_moment_by_its_stiffness(
 
 
 @pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("edges", [2, 3])
+def test_each_seam_of_three_panels_bends_its_own_two(comm: MPI.Comm, model: str, edges: int) -> None:
+    # the third panel stands up, and is sewn to the second one alone
+    content = sewn((2, 2), {"angle": 20.0, "bending": 0.01}, model)
+    grid = {"width": LENGTH, "height": WIDTH, "nx": 1, "ny": edges}
+    upright = {"rotate": {"axis": [0, 1, 0], "degrees": -90}}
+    content["mesh"].append({"name": "three", "grid": grid, "transform": upright})
+    content["seams"].append({"between": ["two/left", "three/left"], "angle": -50.0, "bending": 0.01})
+    with finished(comm, content) as simulation:
+        x = shape(simulation)
+    second, third = (np.degrees(np.arctan2(x[n, 2], x[n, 0])) for n in (11, -1))
+    assert second == pytest.approx(20.0, abs=1e-4)
+    assert third == pytest.approx(20.0 + 180.0 + 50.0 - 360.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("edges", [JOINED, TIED])
 def test_seams_bend_freely_by_default_and_joined_ones_like_the_sheet_else(
     comm: MPI.Comm, model: str, edges: tuple[int, int]
