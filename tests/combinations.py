@@ -159,9 +159,10 @@ EXCEPT = {
     ("curves", "static"),
     ("all", "static"),
     ("liquid", "midpoint"),
+    ("liquid", "static"),
 }
-"""Features without a path of equilibria: what falls, flutters, or lands at once; and pumped liquid, to which
-``midpoint`` gives energy."""
+"""Features without a path of equilibria: what falls, flutters, lands at once, or is slack, as the box while it is
+not filled more than at the start; and pumped liquid, to which ``midpoint`` gives energy."""
 
 
 def scene_with(feature: dict[str, Any], integrator: str, model: str) -> dict[str, Any]:
