@@ -161,8 +161,8 @@ EXCEPT = {
     ("liquid", "midpoint"),
     ("liquid", "static"),
 }
-"""Features without a path of equilibria: what falls, flutters, lands at once, or is slack, as the box while it is
-not filled more than at the start; and pumped liquid, to which ``midpoint`` gives energy."""
+"""Features without a path of equilibria: what falls, flutters, lands at once, or is slack, as the box
+that is filled no more than at the start; and pumped liquid, to which ``midpoint`` gives energy."""
 
 
 def scene_with(feature: dict[str, Any], integrator: str, model: str) -> dict[str, Any]:
