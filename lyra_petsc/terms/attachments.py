@@ -157,12 +157,20 @@ def elements(rest: RestShape) -> Elements:
                     key=f"attachments[{number}]",
                     file=scene.source,
                 )
+            length = distance if attachment.length == "start" else attachment.length
+            breaks_at = np.inf if attachment.breaks_at is None else attachment.breaks_at
+            if (force := attachment.stiffness * abs(distance - length)) > breaks_at:
+                raise InputError(
+                    f"must be above the force of the start, {force:.4g} N; length: start makes that zero",
+                    key=f"attachments[{number}].breaks_at",
+                    file=scene.source,
+                )
             stencil, weight = _padded(vertices, weights, width, rest.mesh.triangles)
             stencils.append(stencil)
             data["weight"].append(weight)
             data["k"].append(attachment.stiffness)
-            data["length"].append(distance if attachment.length == "start" else attachment.length)
-            data["breaks_at"].append(np.inf if attachment.breaks_at is None else attachment.breaks_at)
+            data["length"].append(length)
+            data["breaks_at"].append(breaks_at)
             data["attachment"].append(float(number))
     return Elements(np.array(stencils), {name: np.array(values) for name, values in data.items()})
 

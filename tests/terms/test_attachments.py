@@ -212,6 +212,13 @@ def test_bad_values_are_refused(attachment: dict[str, Any], message: str) -> Non
         scene_of(hanging(**attachment))
 
 
+def test_a_spring_that_is_broken_at_the_start_is_refused() -> None:
+    scene = scene_of(hanging(length=0, breaks_at=3.9))
+    message = r"attachments\[0\]\.breaks_at: must be above the force of the start, 4 N"
+    with pytest.raises(InputError, match=message), finished(MPI.COMM_SELF, scene, **SOLVER):
+        pass
+
+
 def test_points_are_attached_once() -> None:
     scene = hanging()
     scene |= {"attachments": 2 * scene["attachments"]}
