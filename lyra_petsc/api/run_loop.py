@@ -14,7 +14,6 @@ from lyra_petsc.errors import InputError, Interrupted, LyraError, OutputError, S
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.output.run_folder import FolderChoice, RunDirectory
-from lyra_petsc.output.stored import import_h5py_in_background
 from lyra_petsc.output.summary import library_versions, read_summary, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
@@ -64,7 +63,6 @@ def simulate(
         A signal requested it to stop; the last step is in the checkpoint.
     """
     with RunDirectory(comm, choice) as directory:  # locked before the set-up, which may take long
-        import_h5py_in_background()
         simulation = SteppedScene(comm, scene, phases)
         try:
             recorder = Recorder(simulation)

@@ -13,10 +13,9 @@ import math
 import os
 import stat
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,16 +42,6 @@ def import_h5py() -> Any:
     import h5py
 
     return h5py
-
-
-def import_h5py_in_background() -> None:
-    """Import h5py in another thread, while the calling thread waits for gmsh's process."""
-
-    def work() -> None:
-        with suppress(ImportError):  # raised again by the first use
-            import_h5py()
-
-    Thread(target=work, name="lyra-petsc h5py").start()
 
 
 _REMEDY = "a run's folder must hold all of its results"

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import csv
+import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from launch import DIRECT, done, lyra, refusal, refused, write_scene
 
 import lyra_petsc
+from lyra_petsc.mesh.frame_files import UsdFrames
 from lyra_petsc.mesh.obstacles import BOX_TRIANGLES
 from lyra_petsc.show.obstacle_surfaces import run_obstacles
 
@@ -141,3 +144,43 @@ def test_a_body_that_gets_frames_is_shown_where_it_was(tmp_path: Path) -> None:
     (tray,) = run_obstacles(run)
     np.testing.assert_allclose(tray.positions(0.01), CORNERS + [1e-3, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(tray.positions(0.05), down[2], atol=1e-12)
+
+
+def test_usd_is_imported_while_no_other_thread_imports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """USD's libraries give up Python's lock while they are loaded: two threads that import wait for ever."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, Vt
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "pins.usda"))
+    points = UsdGeom.Mesh.Define(stage, "/pins").CreatePointsAttr()
+    for code in (0.0, 2.4):
+        points.Set(Vt.Vec3fArray.FromNumpy(np.full((3, 3), 0.01 * code, dtype=np.float32)), code)
+    stage.GetRootLayer().Save()
+    started: list[str] = []
+    at_import: list[list[str]] = []
+    start, open_usd = threading.Thread.start, UsdFrames.__init__
+
+    def noted(thread: threading.Thread) -> None:
+        started.append(thread.name)
+        start(thread)
+
+    def opened(frames: UsdFrames, file: Path) -> None:
+        at_import.append(list(started))
+        open_usd(frames, file)
+
+    monkeypatch.setattr(threading.Thread, "start", noted)
+    monkeypatch.setattr(UsdFrames, "__init__", opened)
+    scene: dict[str, Any] = {
+        "mesh": {"grid": {"width": 0.2, "height": 0.2, "nx": 2, "ny": 2}},
+        "material": {"cloth": "gray-interlock", "damping": 0.02},
+        "handles": [{"group": "left", "frames": str(tmp_path / "pins.usda"), "interpolation": "linear"}],
+        "time": {"end": 0.05, "step": 0.01},
+        "output": {"every": 0.05},
+    }
+    run = lyra_petsc.run(scene, tmp_path / "run")
+    assert at_import
+    assert not any(at_import)
+    moved = np.asarray(run.positions[-1] - run.positions[0])[[0, 3, 6]]
+    assert np.allclose(moved, 0.012, atol=1e-8)
