@@ -197,7 +197,7 @@ def elements(rest: RestShape) -> Elements:
         seam = rest.scene.seams[number]
         rest.notes.append(
             f"seam {seam.label}: {one:.4g} m and {other:.4g} m long ({100.0 * (other / one - 1.0):+.2f} %), "
-            f"{n} ties, open by up to {gap.max():.3g} m"
+            f"{n} ties, open by up to {gap.max().round(12):.3g} m"
             + (": it closes at once; close: {until: …} gives it time" if _springs_shut(seam, gap) else "")
         )
         stencils.append(ties.stencil)

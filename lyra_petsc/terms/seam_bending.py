@@ -106,7 +106,8 @@ def elements(rest: RestShape) -> Elements:
         if seam.bending is not None:
             stiffness[mine] = seam.bending
         if seam.angle != "free":
-            rest.notes.append(f"seam {seam.label}: {_text(seam, -np.degrees(angle[mine]), stiffness[mine])}")
+            degrees = -np.degrees(angle[mine]).round(9)
+            rest.notes.append(f"seam {seam.label}: {_text(degrees, stiffness[mine])}")
     as_sheet = np.array([seam.bends_as_sheet for seam in seams])[sewn.seam] & (sewn.hinge >= 0)
     chosen = ~np.isnan(angle) & ~as_sheet & (stiffness > 0.0)
     faces, length, heights = sewn.triangles[chosen], sewn.length[chosen], sewn.heights[chosen]
@@ -123,7 +124,7 @@ def elements(rest: RestShape) -> Elements:
     return Elements(sewn.stencil[chosen], data)
 
 
-def _text(seam: Seam, angles: Array, stiffness: Array) -> str:
+def _text(angles: Array, stiffness: Array) -> str:
     """What ``check`` says of angles (n,) [°] and stiffnesses (n,) [N·m]."""
     spans = []
     for values in (angles, stiffness):
