@@ -118,7 +118,7 @@ class Controls:
 
     def set(self, run: SteppedScene, name: str, value: Any, at: float | None) -> None:
         """Change a value until ``at`` [s], or now; see `Simulation.set`."""
-        curve, number = self._named(name, DrivenCurve, "set"), np.asarray(value, dtype=np.float64)
+        curve, number = self._named(name, DrivenCurve, "set"), _numbers(value)
         if number.shape != curve.values[0].shape or not np.isfinite(number).all():
             words = "three finite numbers" if curve.values[0].ndim else "a finite number"
             raise InputError(f"must be {words}, not {shown(value)}", key=name)
@@ -152,19 +152,31 @@ def _time(run: SteppedScene, at: float | None) -> float:
     """The time ``at`` [s], or the end of the next step."""
     if at is None:
         return run.control.next_end(run.time)
-    if not run.time < at < math.inf:
+    time = _numbers(at)
+    if time.shape or not run.time < time < math.inf:
         raise InputError(f"must be later than now, {run.time:g} s, not {shown(at)}", key="at")
-    return float(at)
+    return float(time)
+
+
+def _numbers(values: Any) -> Array:
+    """The values as an array, of NaN if they are no real numbers."""
+    try:
+        rows = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        rows = np.empty((), dtype=object)
+    if rows.dtype.kind in "biuf":
+        return np.asarray(rows, dtype=np.float64)
+    return np.full(rows.shape, np.nan)
 
 
 def finite_rows(comm: MPI.Comm, name: str, values: Any, count: int) -> Array:
     """Finite numbers (count, 3) for a rank's vertices; refuses others on all ranks."""
-    rows = np.asarray(values, dtype=np.float64)
+    rows = _numbers(values)
     problem = ""
     if rows.shape != (count, 3):
         problem = f"has shape {rows.shape}, not ({count}, 3): a row for each of .vertices"
     elif not np.isfinite(rows).all():
-        problem = "has numbers that are not finite"
+        problem = "has entries that are not finite numbers"
     for text in comm.allgather(problem):
         if text:
             raise InputError(text, key=f"Simulation.{name}")

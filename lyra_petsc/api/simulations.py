@@ -318,6 +318,8 @@ class Simulation:
 
     def restore(self, saved: SavedState) -> None:
         """Return to a state that this simulation has saved; it goes on as it went on from there."""
+        if not isinstance(saved, SavedState):
+            raise InputError("needs what save() returned", key="Simulation.restore")
         self.reset()
         run = self._running
         self._controls.restore(saved.driven)

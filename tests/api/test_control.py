@@ -260,6 +260,16 @@ def test_mistakes_name_the_call_to_use() -> None:
             sheet.positions = np.zeros((3, 3))
         with pytest.raises(lyra_petsc.InputError, match="not finite"):
             sheet.velocities = np.full((25, 3), np.nan)
+        for unusable in ("abc", [[1.0, 2.0], [3.0]], sheet.positions + 1j, None):
+            with pytest.raises(lyra_petsc.InputError, match=r"row for each of \.vertices|not finite"):
+                sheet.forces = unusable
+            with pytest.raises(lyra_petsc.InputError, match="must be three finite numbers"):
+                sheet.set("gravity", unusable)
+        for unusable in ("x", [1.0], float("nan")):
+            with pytest.raises(lyra_petsc.InputError, match="must be later than now"):
+                sheet.move("handles[0]", at=unusable)
+        with pytest.raises(lyra_petsc.InputError, match=r"needs what save\(\) returned"):
+            sheet.restore(None)  # type: ignore[arg-type]
         with pytest.raises(lyra_petsc.InputError, match=r"drives=\['wind.velocity'\]"):
             sheet.set("wind.velocity", [0, 1, 0])
         with pytest.raises(lyra_petsc.InputError, match="must be later than now"):
@@ -272,6 +282,7 @@ def test_scenes_are_immutable() -> None:
     scene = lyra_petsc.load(SCENE)
     for change in (
         lambda: setattr(scene.time, "end", 2.0),
+        lambda: delattr(scene, "gravity"),
         lambda: scene.handles.append(scene.handles[0]),
         lambda: scene.petsc.update(ksp_type="cg"),
         lambda: scene.probes.__setitem__("tip", None),
