@@ -57,7 +57,10 @@ def drive(scene: Scene, names: Iterable[str]) -> tuple[Scene, dict[str, Driven]]
         For a name of what cannot be driven.
     """
     places, driven = _places(scene), {}
+    in_frames = {f"handles[{i}]" for i, handle in enumerate(scene.handles) if handle.frames is not None}
     for name in names:
+        if name in in_frames:
+            raise InputError(f"{name} moves by its frames; leave these out to drive it", key="drives")
         if name not in places:
             raise InputError(f"cannot drive {name!r}, {suggest(name, places)}", key="drives")
         path = places[name]
@@ -112,6 +115,8 @@ class Controls:
         keys = {key: value for key, value in place.items() if value is not None}
         with python_argument_names():
             target = validated(Keyframe, {"time": time, **keys}, file=None)
+        if name.startswith("obstacles.") and target.scale not in (1.0, (1.0, 1.0, 1.0)):
+            raise InputError("an obstacle is rigid: leave out scale", key=name)
         if motion.go_to(target, run.time):
             run.expect_jump(run.time)
         run.follow_driven(time)

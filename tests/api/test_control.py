@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -276,6 +277,18 @@ def test_mistakes_name_the_call_to_use() -> None:
             sheet.move("handles[0]", at=-1.0)
         with pytest.raises(ValueError, match="read-only"):
             sheet.positions[0] = 1.0
+
+
+def test_what_cannot_move_so_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "top.npz", time=[0.0, 0.1], position=np.zeros((2, 5, 3)))
+    framed = SCENE | {"handles": [{"group": "top", "frames": str(tmp_path / "top.npz")}]}
+    with pytest.raises(lyra_petsc.InputError, match=r"handles\[0\] moves by its frames"):
+        lyra_petsc.Simulation(framed, drives=["handles[0]"])
+    ball = {"sphere": {"center": [0.2, 0.2, -0.13], "radius": 0.12}}
+    scene = SCENE | {"contact": {}, "obstacles": {"ball": ball}}
+    rigid = pytest.raises(lyra_petsc.InputError, match="an obstacle is rigid: leave out scale")
+    with lyra_petsc.Simulation(scene, drives=["obstacles.ball"]) as sheet, rigid:
+        sheet.move("obstacles.ball", scale=2.0)
 
 
 def test_scenes_are_immutable() -> None:
