@@ -41,12 +41,12 @@ class EdgeSolve:
     Attributes
     ----------
     step : TimeStep
-    velocity : (n_owned, 3)
-        Velocities [m/s] of its stage.
+    evaluation : Evaluation
+        Of its stage.
     """
 
     step: TimeStep
-    velocity: Array
+    evaluation: Evaluation
 
     @classmethod
     def begin(cls, equations: StageEquations, x_before: Array) -> EdgeSolve:
@@ -55,7 +55,7 @@ class EdgeSolve:
         Before the first step they are those at these positions, after `initial_moments`.
         """
         step, n = equations.step, len(equations.mass)
-        interrupted, dt = cls(step, equations.evaluated.v[: len(equations.mass)]), step.dt or 1.0
+        interrupted, dt = cls(step, equations.evaluated), step.dt or 1.0
         equations.predicted_stress.forget()
         held = equations.prescriptions.with_vertices(step.prescribed, equations.x[:n])
         equations.change(
@@ -78,4 +78,4 @@ class EdgeSolve:
         equations.predicted_stress.forget()
         if solution is not None:
             equations.state.set_edges(solution.x)
-        equations.evaluate(self.velocity)
+        equations.revisit(self.evaluation)
