@@ -11,8 +11,9 @@ import numpy as np
 ROUND_OFF = 1e-9
 """Fraction of Δt by which times differ that are computed in different ways."""
 
-SLACK = 1e-6
-"""Fraction of Δt by which a step may be longer to avoid an extra tiny one, and times count as one."""
+SLACK = 1e-4
+"""Fraction of Δt by which a step may be longer to avoid an extra tiny one, and times count as one: above the
+round-off of times in single precision."""
 
 LEAST_REST = 0.1
 """Fraction of Δt below which no step is left over before a time on which one must end."""
