@@ -156,9 +156,9 @@ def test_ranks_agree_and_a_run_goes_on_on_another_number(
     comm: MPI.Comm, model: str, integrator: str, steps: int, shared_tmp: Path
 ) -> None:
     """From a checkpoint while the seam closes, and from one after that."""
-    content = two_tubes(comm, shared_tmp, 0.01, angle=0.0, bending=1e-4, **CLOSING)
+    content = two_tubes(comm, shared_tmp, 0.01, angle=0.0, **CLOSING)
     content["time"]["integrator"] = integrator
-    content["material"]["bending_model"] = model
+    content["material"] |= {"bending_model": model, "bending": 1e-2}  # soft tubes buckle, one way or another
     scene = scene_of(content)
     with finished(comm, scene) as simulation:
         x = shape(simulation)
