@@ -98,15 +98,14 @@ def sewn_shut(triangles: Ints, seams: Sequence[SewnCurves]) -> Ints:
     boundary = {frozenset(edge) for edge in _boundary(triangles).tolist()}
     strips, ends = [triangles], set()
     for sewn in seams:
-        paths = [side.vertices.tolist() for side in sewn.sides]
-        if all(frozenset(edge) in boundary for path in paths for edge in pairwise(path)):
+        one, other = (side.vertices.tolist() for side in sewn.sides)
+        if all(frozenset(edge) in boundary for path in (one, other) for edge in pairwise(path)):
             strips.append(_strip(*sewn.sides))
-            ends |= {frozenset((one[at], other[at])) for one, other in (paths,) for at in (0, -1)}
+            ends |= {frozenset((one[at], other[at])) for at in (0, -1)}
     shut = np.concatenate(strips)
     shut = shut[(shut != np.roll(shut, 1, axis=1)).all(axis=1)]  # where both sides have a vertex in common
-    left = np.array([e for e in _boundary(shut).tolist() if frozenset(e) in ends], dtype=np.int64).reshape(
-        -1, 2
-    )
+    rows = [edge for edge in _boundary(shut).tolist() if frozenset(edge) in ends]
+    left = np.array(rows, dtype=np.int64).reshape(-1, 2)
     curve = connected_components(int(triangles.max()) + 1, left)[left[:, 0]]
     for number in np.unique(curve):
         if (np.bincount(left[curve == number].ravel()) % 2 == 0).all():

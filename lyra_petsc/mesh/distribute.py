@@ -190,9 +190,7 @@ def _partition(
 def distribute(comm: MPI.Comm, whole: GlobalMesh | None) -> LocalMesh:
     """Partition the mesh and send each rank its part; collective. ``whole`` is needed on rank 0 only."""
     n_vertices = comm.bcast(whole.n_vertices if whole else 0, root=0)
-    graph = None
-    if whole:
-        graph = vertex_graph([whole.triangles], n_vertices)
+    graph = vertex_graph([whole.triangles], n_vertices) if whole else None
     if comm.bcast(whole is not None and whole.owner is not None):
         owner, name = (whole.owner if whole else None), "given"
     else:

@@ -101,28 +101,33 @@ def on_a_ball(folder: Path, seed: int | None) -> dict[str, Any]:
     }
 
 
-def test_layers_reach_the_equilibrium_of_a_start_apart(tmp_path: Path) -> None:
-    apart = equilibrium(hammocks(tmp_path, None))
+def started_apart(scene: dict[str, Any]) -> Equilibrium:
+    """The equilibrium of a scene that starts without crossings, in which contact acts."""
+    apart = equilibrium(scene)
     assert "untangled" not in apart.notes
     assert apart.contact > 0.0
+    return apart
+
+
+def check_untangled(untangled: Equilibrium, apart: Equilibrium) -> None:
+    """Check that an untangled start has led to the equilibrium of a start apart."""
+    assert "untangled the start: " in untangled.notes
+    assert untangled.total == pytest.approx(apart.total, rel=0.01)
+    assert untangled.elastic == pytest.approx(apart.elastic, rel=0.01)
+
+
+def test_layers_reach_the_equilibrium_of_a_start_apart(tmp_path: Path) -> None:
+    apart = started_apart(hammocks(tmp_path, None))
     for seed in range(4):
-        untangled = equilibrium(hammocks(tmp_path, seed))
-        assert "untangled the start: " in untangled.notes
-        assert untangled.total == pytest.approx(apart.total, rel=0.01)
-        assert untangled.elastic == pytest.approx(apart.elastic, rel=0.01)
+        check_untangled(equilibrium(hammocks(tmp_path, seed)), apart)
     # the wrong order would be seen
     exchanged = equilibrium(hammocks(tmp_path, None, exchanged=True))
     assert abs(exchanged.elastic / apart.elastic - 1.0) > 0.05
 
 
 def test_a_sheet_reaches_the_equilibrium_on_a_ball(tmp_path: Path) -> None:
-    apart = equilibrium(on_a_ball(tmp_path, None))
-    assert "untangled" not in apart.notes
-    assert apart.contact > 0.0
+    apart = started_apart(on_a_ball(tmp_path, None))
     for seed in range(3):
-        untangled = equilibrium(on_a_ball(tmp_path, seed))
-        assert "untangled the start: " in untangled.notes
-        assert untangled.total == pytest.approx(apart.total, rel=0.01)
-        assert untangled.elastic == pytest.approx(apart.elastic, rel=0.01)
+        check_untangled(equilibrium(on_a_ball(tmp_path, seed)), apart)
     free = equilibrium(on_a_ball(tmp_path, None) | {"obstacles": {}})
     assert abs(free.elastic / apart.elastic - 1.0) > 0.05
